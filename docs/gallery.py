@@ -24,7 +24,6 @@ HEAD = """\
 # Gallery
 
 This page shows every picture of `hks_jax.plot`, with a link to the function of [gallery.py](gallery.py) that draws it.
-`python docs/gallery.py` draws the pictures and writes this page.
 """
 
 IMPORTS = """\
@@ -258,7 +257,7 @@ def fit() -> Figure:
 
 
 def volume() -> Figure:
-    """Three orthogonal slices at several times show a narrow maximum of the metric first, and later a wide one."""
+    """On three orthogonal slices, small times show a narrow maximum of the metric, and large times a wide one."""
     n = 20
     grid = hj.Grid((n, n, n), 2 / n, -1.0)
     factor = np.ones(grid.shape)

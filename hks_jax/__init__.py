@@ -34,7 +34,6 @@ from hks_jax.domain.simplicial_mesh import TetMesh as TetMesh
 from hks_jax.domain.tensor_field import TensorField as TensorField
 from hks_jax.eigen.complement.adjoint import Adjoint as Adjoint
 from hks_jax.eigen.complement.factorised_adjoint import FactorisedAdjoint as FactorisedAdjoint
-from hks_jax.eigen.dense import Dense as Dense
 from hks_jax.eigen.driver import eigenpairs as eigenpairs
 from hks_jax.eigen.driver import eigsh as eigsh
 from hks_jax.eigen.eigenpairs import RESULTS as RESULTS
@@ -45,6 +44,7 @@ from hks_jax.eigen.host.host_adjoint import HostAdjoint as HostAdjoint
 from hks_jax.eigen.host.shift_invert import ShiftInvert as ShiftInvert
 from hks_jax.eigen.inertia import count_eigenvalues as count_eigenvalues
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos as BlockLanczos
+from hks_jax.eigen.solver import Dense as Dense
 from hks_jax.eigen.solver import Eigensolver as Eigensolver
 from hks_jax.eigen.weyl import weyl_count as weyl_count
 from hks_jax.fem.assembly import assemble as assemble
@@ -59,7 +59,6 @@ from hks_jax.linear.dense_eigh import eigh as eigh
 from hks_jax.linear.factorised_matrix import FactorisedMatrix as FactorisedMatrix
 from hks_jax.linear.matrix_function import matrix_function as matrix_function
 from hks_jax.linear.pencil import SymmetricPencil as SymmetricPencil
-from hks_jax.signatures.boundary import boundary_influence as boundary_influence
 from hks_jax.signatures.distances import biharmonic_distance as biharmonic_distance
 from hks_jax.signatures.distances import diffusion_distance as diffusion_distance
 from hks_jax.signatures.distances import global_point_signature as global_point_signature
@@ -69,6 +68,7 @@ from hks_jax.signatures.flow import gaussian_scale_space as gaussian_scale_space
 from hks_jax.signatures.flow import heat_flow as heat_flow
 from hks_jax.signatures.flow import tensor_invariants as tensor_invariants
 from hks_jax.signatures.hks import AutomaticHKS as AutomaticHKS
+from hks_jax.signatures.hks import boundary_influence as boundary_influence
 from hks_jax.signatures.hks import hks as hks
 from hks_jax.signatures.hks import hks_auto as hks_auto
 from hks_jax.signatures.kernels import heat_kernel as heat_kernel

@@ -15,14 +15,9 @@ from hks_jax.traced import is_traced
 def require_number(
     name: str, value: Any, below: float = math.inf, *, above: float = 0.0, inclusive: bool = False
 ) -> None:
-    """Raise ValueError unless a setting is a real number between two exclusive limits; traced numbers pass.
+    """Raise ValueError unless a setting is a real number between two limits; traced numbers pass.
 
-    Args:
-        name: the name of the argument.
-        value: a number, or an array without axes.
-        below: the upper limit.
-        above: the lower limit.
-        inclusive: whether the lower limit itself is allowed.
+    The limits are exclusive, except that the lower one may be inclusive.
     """
     if is_traced(value):
         return
@@ -41,7 +36,7 @@ def require_real(name: str, values: Any) -> None:
     leaves = jax.tree.leaves(values)
     if any(np.iscomplexobj(leaf) for leaf in leaves):
         raise ValueError(
-            f"{name}: got complex numbers; expected real numbers. Pass the real part if the rest is rounding"
+            f"{name}: got complex numbers; expected real numbers. Pass the real part if the imaginary part is rounding"
         )
     if any(isinstance(leaf, np.ndarray) and leaf.dtype.kind == "f" and leaf.dtype.itemsize > 8 for leaf in leaves):
         raise ValueError(f"{name}: got {np.dtype(np.longdouble)}, which JAX does not support; use .astype(np.float64)")

@@ -91,19 +91,24 @@ _FEW = 1 << 19
 """The largest number of array entries for which NumPy is faster than compilation, even for many calls."""
 
 
-def numpy_where_known(**settings: Any) -> Callable[[Callable[..., T]], Callable[..., T]]:
+def numpy_where_known(
+    jit: Callable | None = None, most: int = _FEW, **settings: Any
+) -> Callable[[Callable[..., T]], Callable[..., T]]:
     """Return a decorator for functions whose first argument is the array module, `numpy` or `jax.numpy`.
 
-    If the arguments are concrete, small and on a CPU, NumPy evaluates the function without compilation. Otherwise, the
-    function is compiled by `jax.jit` with the settings. The results are JAX arrays in both cases.
+    If the arguments are concrete, on a CPU, and have at most ``most`` entries, the function is evaluated without
+    compilation, with NumPy arrays in place of JAX arrays and SciPy matrices in place of operators. Otherwise, the
+    function is compiled by ``jit``, by default `jax.jit` with the settings. The results are JAX arrays in both cases.
+    The decision depends only on shapes and devices, so repeated computations have the same rounding.
     """
 
     def decorate(function: Callable[..., T]) -> Callable[..., T]:
-        compiled = jax.jit(partial(function, jnp), **settings)
+        compiled = (jit or partial(jax.jit, **settings))(partial(function, jnp))
 
         @wraps(function)
         def call(*args: Any) -> T:
-            return by_numpy(partial(function, np), *args) if known_and_few(args) else compiled(*args)
+            is_small = sum(np.size(leaf) for leaf in jax.tree.leaves(args)) <= most
+            return by_numpy(partial(function, np), *args) if is_small and is_concrete_on_cpu(args) else compiled(*args)
 
         return call
 
@@ -111,22 +116,18 @@ def numpy_where_known(**settings: Any) -> Callable[[Callable[..., T]], Callable[
 
 
 def by_numpy(function: Callable[..., Any], *args: Any) -> Any:
-    """Evaluate a function with NumPy arrays in place of JAX arrays; return its result as JAX arrays."""
-    known = jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, args)
+    """Evaluate a function with arrays and matrices of NumPy and SciPy; return its result as JAX arrays."""
+
+    def on_host(x: Any) -> Any:
+        return x.to_scipy() if hasattr(x, "to_scipy") else np.asarray(x) if isinstance(x, jax.Array) else x
+
+    known = jax.tree.map(on_host, args, is_leaf=lambda x: hasattr(x, "to_scipy"))
     with np.errstate(all="ignore"):
         # `device_put`, because `jnp.asarray` returns NumPy arrays during differentiation.
         return jax.device_put(jax.tree.map(np.asarray, function(*known)))
 
 
-def known_and_few(args: Any) -> bool:
-    """Return whether values are `known_here` and have at most `_FEW` entries, so that NumPy computes.
-
-    The decision depends only on shapes and devices, so repeated computations have the same rounding.
-    """
-    return known_here(args) and sum(np.size(leaf) for leaf in jax.tree.leaves(args)) <= _FEW
-
-
-def known_here(args: Any) -> bool:
+def is_concrete_on_cpu(args: Any) -> bool:
     """Return whether all values are concrete, and each is on one CPU device of a single process."""
     if is_staged() or is_traced(args) or jax.default_backend() != "cpu" or jax.process_count() > 1:
         return False
@@ -167,7 +168,7 @@ class _Program(NamedTuple):
         return [own if fixed is None else fixed for own, fixed in zip(known, self.fixed, strict=True)], x
 
     def by_numpy(self, *leaves: Any) -> Any:
-        """Evaluate the function by NumPy, or return None."""
+        """Evaluate the function by NumPy, or return None if there is no rule or values are not concrete on one CPU."""
         return _apply(self.numpy_rule, self.args(*leaves), None, None)
 
 
@@ -206,7 +207,7 @@ class _LinearMap(NamedTuple):
         return list(jax.linear_transpose(forward, *self.x)(rest)) if self.transposed else forward(*rest)
 
     def by_numpy(self, *leaves: Any) -> Any:
-        """Apply the map by NumPy, or return None."""
+        """Apply the map by NumPy, or return None if there is no rule or values are not concrete on one CPU."""
         known, rest = self.split(leaves)
         x, y = (self.x, [np.asarray(each) for each in rest]) if self.transposed else (rest, None)
         args, change = self.program.split(*known[: len(known) - self.tangent * len(x)], *x)
@@ -226,7 +227,7 @@ _quick = jax.jit(_call, static_argnums=0, compiler_options=_OPTIONS)
 
 
 def _apply(rule: NumPyRule | None, known: Sequence[Any], *others: list[Any] | None) -> Any:
-    if rule is None or not known_here((known, others)):
+    if rule is None or not is_concrete_on_cpu((known, others)):
         return None
     with np.errstate(all="ignore"):
         return jax.device_put(rule(list(known), *others))

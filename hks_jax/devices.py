@@ -45,7 +45,7 @@ def map_fields(function: Callable[[Any], Any], batch: Any, mesh: Mesh) -> Any:
     mesh = checked_mesh(mesh)
     lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(batch)}
     if len(lengths) != 1 or lengths & {(), (0,)}:
-        raise ValueError(f"batch: got leading axes {sorted(lengths)}; expected arrays of the same length, at least 1")
+        raise ValueError(f"batch: got leading axes of lengths {sorted(lengths)}; expected one length, at least 1")
     return _map(function, batch, mesh)
 
 

@@ -15,11 +15,7 @@ _LIBRARIES = {
 
 
 def optional(module: str) -> ModuleType:
-    """Import a module of an optional library, such as ``"nibabel"`` or ``"dipy.reconst.dti"``.
-
-    Raises:
-        ImportError: if the library is not installed, with the command that installs it.
-    """
+    """Import a module of an optional library, such as ``"dipy.reconst.dti"``; an ImportError has the remedy."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

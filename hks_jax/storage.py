@@ -120,33 +120,22 @@ def _hold(file: Path) -> IO[str] | None:
         # the file and its folder.
         with suppress(FileNotFoundError):
             held = open(file, "a", encoding="utf-8")  # noqa: SIM115
-            if not _lock(held):
+            try:
+                if fcntl is not None:
+                    fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
                 held.close()
                 return None
+            except OSError:  # a drive without locks
+                pass
             with suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(held.fileno()), file.stat()):
                     return held
             held.close()
 
 
-def _lock(held: IO[str]) -> bool:
-    if fcntl is None:
-        return True
-    try:
-        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:  # a drive without locks
-        return True
-    return True
-
-
 def existing(path: str | os.PathLike[str]) -> Path:
-    """Return the path of a file that exists.
-
-    Raises:
-        FileNotFoundError: if the path does not exist or is a folder.
-    """
+    """Return the path of a file; raise FileNotFoundError if it does not exist or is a folder."""
     file = Path(path)
     if not file.is_file():
         what = "is a folder; expected a file" if file.is_dir() else "no such file"
@@ -159,11 +148,8 @@ def reading(path: str | os.PathLike[str], kind: str) -> Iterator[None]:
     """Convert every error that a library raises for the content of a file to a ValueError that names the file.
 
     Libraries raise nearly any error for damaged files: errors of the parser, of struct, zlib and zipfile, of indices,
-    or of memory for impossible sizes. The body should contain only the library's call and checks of its result.
-
-    Args:
-        path: the file.
-        kind: the expected kind of file with its article, such as ``"a readable npz archive"``.
+    or of memory for impossible sizes. The body should contain only the library's call and checks of its result. The
+    kind of file has its article, as in ``"a readable npz archive"``.
     """
     try:
         yield
@@ -179,13 +165,9 @@ def reading(path: str | os.PathLike[str], kind: str) -> Iterator[None]:
 
 
 def load_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-    """Return all arrays of an npz archive by name.
+    """Return all arrays of an npz archive by name, after their checksums are verified.
 
-    The checksum of each array in the archive is verified.
-
-    Raises:
-        FileNotFoundError: if the file does not exist.
-        ValueError: if the file is no npz archive, is damaged, or contains pickled objects.
+    A file that is no such archive, is damaged, or contains pickled objects raises ValueError.
     """
     file, arrays = existing(path), {}
     with reading(file, "a readable npz archive of plain arrays"), zipfile.ZipFile(file) as archive:
@@ -214,11 +196,9 @@ def _check_number(file: Path, archive: zipfile.ZipFile) -> None:
 
 
 def load_npy(path: str | os.PathLike[str]) -> np.ndarray:
-    """Return the array of an npy file. Without a checksum only the file's length is compared with the declared length.
+    """Return the array of an npy file, with errors as in `load_npz`.
 
-    Raises:
-        FileNotFoundError: if the file does not exist.
-        ValueError: if the file is no npy file, is damaged, or contains pickled objects.
+    There is no checksum; only the file's length is compared with the declared length.
     """
     file = existing(path)
     with reading(file, "a readable npy array"), open(file, "rb") as stream:

@@ -71,7 +71,7 @@ def lanczos(n: int, k: int) -> Iterator[Task]:
     plan = hj.BlockLanczos().plan(k, pencil.space.n_null)
     dissection = dissect(pencil.pattern)
     problem = jax.eval_shape(lambda p: expected(p, plan), pencil)
-    state = jax.eval_shape(lambda p: first_state(p, plan), problem)
+    state, stored = jax.eval_shape(lambda p: first_state(p, plan), problem)
     shift = state.shift
     entries = jax.eval_shape(lambda p, s: p.shifted(s), pencil, shift)
     factor = jax.eval_shape(factorise, dissection, entries)
@@ -80,13 +80,12 @@ def lanczos(n: int, k: int) -> Iterator[Task]:
     going = jax.eval_shape(begin, pencil, state.start, known)
     nodes = f"{n}²"
 
-    apart = state._replace(vectors=None)
     trial = jax.eval_shape(try_out, factor, pencil, shift, state.noise)
 
-    def look(problem: Any, state: Any) -> Any:
-        return slicing._window(problem, plan, state, plan.window)
+    def look(problem: Any, state: Any, stored: Any) -> Any:
+        return slicing._window(problem, plan, state, stored, plan.window)
 
-    window = jax.eval_shape(look, problem, state)
+    window = jax.eval_shape(look, problem, state, stored)
     ritz = (
         jax.ShapeDtypeStruct((plan.ritz,), np.float64),
         jax.ShapeDtypeStruct((plan.ritz, pencil.size), np.float64),
@@ -113,15 +112,15 @@ def lanczos(n: int, k: int) -> Iterator[Task]:
             (going, plan.steps),
         ),
     )
-    yield "making room", nodes, k, lambda: (jax.jit(partial(make_room, plan), donate_argnums=0), (state,))
+    yield "making room", nodes, k, lambda: (jax.jit(partial(make_room, plan), donate_argnums=1), (state, stored))
     yield "trial of it", nodes, k, lambda: (try_out, (factor, pencil, shift, state.noise))
-    yield "decisions", nodes, k, lambda: (consider, (problem, factor.negative, trial, apart))
-    yield "window", nodes, k, lambda: (look, (problem, state))
+    yield "decisions", nodes, k, lambda: (consider, (problem, factor.negative, trial, state))
+    yield "window", nodes, k, lambda: (look, (problem, state, stored))
     yield "first block", nodes, k, lambda: (begin, (pencil, state.start, known))
-    yield "acceptance", nodes, k, lambda: (accept, (problem, ritz, window[1], apart))
+    yield "acceptance", nodes, k, lambda: (accept, (problem, ritz, window[1], state))
     order = jax.ShapeDtypeStruct((plan.ritz,), int)
     store = jax.jit(slicing._stored, donate_argnums=0)
-    yield "storing", nodes, k, lambda: (store, (state.vectors, ritz[1], order, state.known))
+    yield "storing", nodes, k, lambda: (store, (stored, ritz[1], order, state.known))
 
 
 def whole(rows: list[dict], n: int, k: int) -> Iterator[dict]:

@@ -65,11 +65,12 @@ def count(pencil: Pencil, k: int) -> tuple[int, int, bool]:
     plan = hj.BlockLanczos(TOLERANCE).plan(k, pencil.space.n_null)
     problem = expected(pencil, plan)
     slices = max(round(k / 170), 1)
-    dissection, state, searches = jax.device_put(dissect(pencil.pattern)), first_state(problem, plan), 0
-    while unfinished(plan, state):
-        factor, searchable, state = cut(problem, dissection, plan, state)
+    dissection, both, searches = jax.device_put(dissect(pencil.pattern)), first_state(problem, plan), 0
+    while unfinished(plan, both[0]):
+        factor, searchable, both = cut(problem, dissection, plan, *both)
         if searchable:
-            state, searches = search(problem, factor, plan, state), searches + 1
+            both, searches = search(problem, factor, plan, both), searches + 1
+    state = both[0]
     return int(state.slices) - slices - 1, searches - slices, bool(state.finished)
 
 

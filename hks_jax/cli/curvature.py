@@ -54,7 +54,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     if not known.any():
         raise ValueError("tensors: finite differences need a grid line with 8 nodes inside the mask; got none")
     if lacking := int((inside & ~known).sum()):
-        progress.note(f"the curvature is NaN at {lacking} nodes too near the mask's boundary for finite differences")
+        progress.note(f"the curvature is NaN at {lacking} nodes that are too near the mask's boundary")
     density = np.sqrt(np.linalg.det(np.asarray(field.domain_tensors, np.float64)))[known]
     values = curvature[known].astype(np.float64)
     report = {

@@ -63,8 +63,8 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     spread = (rf"($\sqrt{{Dt}}$ ≈ {length:.2g} mm)" for length in lengths)
     titles = [f"$t$ = {number_text(t)} s  {text}" for t, text in zip(times, spread, strict=True)]
     title = (
-        rf"$4\pi t\,$HKS of {'a phantom' if brain is None else 'a brain slice'}, metric D⁻¹. The value 1 means flat, "
-        "larger values mean positive curvature, including that of the boundary"
+        rf"$4\pi t\,$HKS of {'a phantom' if brain is None else 'a brain slice'}, metric D⁻¹. The value 1 means flat; "
+        "larger values mean positive curvature of the metric or the boundary"
     )
     first = "mean diffusivity, mm²/s", mean
     drawing = partial(signature_panels, result, titles=titles, first=first, title=title, view=args.view)

@@ -2,8 +2,8 @@
 
 Write a page to explore the signature that 'hks-jax hks' has written to the folder OUT. The page is one HTML file that
 any browser opens without a network. It has sliders for t and the slice, maps of the signature and of the tensors,
-curves over t at chosen points, the distance of a chosen point's curve to all others, and mean curves of regions. Curves
-can be saved as CSV, and surfaces can be rotated.
+curves over t at chosen points, the distances between a chosen point's curve and all other curves, and mean curves of
+regions. Curves can be saved as CSV, and surfaces can be rotated.
 
 examples:
   hks-jax hks tensor.nii.gz -o out --mask mask.nii.gz --slice z=14 --metric inverse --times auto:24

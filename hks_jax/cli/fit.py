@@ -49,10 +49,10 @@ target TARGET  the signature, an .npz file
 --smoothness LENGTH
     smoothing length of the steps, in coordinate units (default a tenth of the domain, or 0 for conformal without
     --noise)
---h1 WEIGHT  penalise slopes by ½ WEIGHT · mean |∇p|² of the parameters p
+--h1 WEIGHT  penalise slopes of the unknowns p by ½ · WEIGHT · mean |∇p|²
 --tv WEIGHT  penalise the total variation, which keeps edges sharp
 --max-steps N = 50  largest number of steps per stage
---continuation N = 1  number of stages, which add times from large to small
+--continuation N = 1  number of stages; each stage adds smaller times
 --starts N = 1  number of starts; all but the first begin at random perturbations of --init
 --seed N = 0  seed of the random perturbations
 --optimiser gauss-newton|lbfgs|bfgs = gauss-newton  optimisation method

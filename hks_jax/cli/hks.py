@@ -52,12 +52,12 @@ OPTIONS = f"""
 --through I,J,K  voxel through which the slices in the picture of a volume pass (default: a voxel in the middle)
 @clean
 --tensors FILE
-    tensors of a volume that contains the mesh, such as a cortical surface. The tensors are interpolated at the vertices
-    in scanner coordinates (FreeSurfer's surfaces are moved by c_ras, GIFTI's by their transformation). The options on
-    voxels and numbers refer to this file
+    tensors of a volume that contains the mesh (a cortical surface, for example). The tensors are interpolated at the
+    vertices in scanner coordinates (FreeSurfer's surfaces are moved by c_ras, GIFTI's by their transformation). The
+    options on voxels and on the meaning of numbers refer to this file
 --inside FILE
-    vertices of a mesh that form the domain, such as a cortical surface without its medial wall, as FreeSurfer's .label,
-    or as zeros and ones in .npy or in the array 'mask' of an .npz
+    vertices of a mesh that form the domain, such as a cortical surface without its medial wall: FreeSurfer's .label, or
+    zeros and ones in .npy or in the array 'mask' of an .npz
 @signature @noise @view
 --save-pairs  write the eigenpairs to OUT/pairs.npz; 'hks-jax hks OUT/pairs.npz --times …' reuses them
 """
@@ -191,7 +191,7 @@ def _read_domain(args: argparse.Namespace, progress: Progress) -> tuple[SurfaceM
     arrays = read_mesh_arrays(args.file, clean=args.clean)
     if args.array not in arrays:
         there = ", ".join(arrays) or "none"
-        raise ValueError(f"--array: got {args.array!r}; expected an array at the vertices: {there}")
+        raise ValueError(f"--array: got {args.array!r}; expected one of the arrays at the vertices: {there}")
     values = arrays[args.array].reshape(len(vertices), -1)
     if values.shape[1] != (9 if args.order is None else 6):
         n = values.shape[1]

@@ -32,7 +32,7 @@ from hks_jax.io.mesh import is_mesh
 from hks_jax.io.repair import find_unsymmetric
 from hks_jax.io.units import MM2_PER_S, by_axis, is_plausible
 from hks_jax.io.volume import digest
-from hks_jax.signatures.suitable import suitable, suitable_times
+from hks_jax.signatures.times import suitable, suitable_times
 
 OPTIONS = f"@file {READING} @clean"
 

@@ -20,7 +20,7 @@ from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result
 from hks_jax.io.units import median_mean_diffusivity
 from hks_jax.signatures.hks import HKSMethod, Normalisation
-from hks_jax.signatures.suitable import SHOWN, default_k
+from hks_jax.signatures.times import SHOWN, default_k
 
 
 class ComputationError(RuntimeError):

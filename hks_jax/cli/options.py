@@ -40,7 +40,7 @@ file FILE...
     the treatment, without --mask, of voxels that a program filled with equal isotropic tensors or tensors near zero:
     outside or inside the domain (default: inside, with a warning; zero tensors are always outside)
 --erode N = 0  remove N layers of voxels from the boundary of the mask
-[numbers] meaning of the numbers: needed only if the file does not declare it; a wrong axis mirrors the tensors
+[numbers] meaning of the numbers: needed only if the file does not declare it. Wrong axes mirror the tensors.
 --order ORDER  order of the components
 --frame voxel|fsl|world|measurement
     axes of the components: the voxel axes (voxel), the axes of FSL's b-vectors (fsl, for tensors from DIPY and FSL),
@@ -54,7 +54,7 @@ file FILE...
 [invalid] tensors that are not positive definite: by default, they raise an error
 --repair HOW[:FLOOR]
     repair of a few tensors: clip raises their eigenvalues to FLOOR (1 % of the median mean eigenvalue), mask leaves
-    their voxels out, nearest uses the nearest valid tensor. FLOOR also adds tensors with a smaller eigenvalue
+    their voxels out, nearest uses the nearest valid tensor. With FLOOR, tensors with a smaller eigenvalue are repaired
 --positive HOW:NUMBER
     map for tensors T that are naturally indefinite, such as stress: exp:S uses exp(T/S) and shift:C uses T + C·I as the
     metric; combine it with --metric tensor
@@ -65,7 +65,7 @@ file FILE...
 --bvec-frame fsl|voxel|world
     axes of the directions: the voxel axes, the first reversed if the affine's determinant is positive (fsl, the
     default, for FSL, dcm2niix and BIDS), the voxel axes (voxel), or the scanner's axes (world, for MRtrix)
---b-max B  largest b-value used, in s/mm2; tensors are a model for b ≲ 1500
+--b-max B  largest b-value used, in s/mm2; the tensor model holds for b ≲ 1500
 [domain]
 --components raise|largest|all = raise
     if the mask is not connected: raise an error (default), keep the largest component, or keep all components
@@ -79,9 +79,9 @@ file FILE...
 --boundary CONDITION
     neumann; mean (the average of the Neumann and Dirichlet problems, which reduces the influence of a mask's boundary);
     dirichlet; dirichlet-rim (also on the boundary of a mask); periodic; or mirror. Give one condition for all axes, or
-    one per axis, as in neumann,periodic, which a condition for the boundary of a mask may follow. low:high gives
+    one per axis, as in neumann,periodic; a condition for the boundary of a mask may follow them. low:high gives
     different conditions at the two sides of an axis, as in neumann:dirichlet,neumann (default: mean if the domain has a
-    mask, otherwise neumann; neumann for meshes and spectra; for a study, its previous condition, at first mean)
+    mask, otherwise neumann; neumann for meshes and spectra; for a study, its previous condition, or mean at first)
 -k K
     number of eigenpairs; for the boundary mean, the number for both problems together (default 200, or 100 for a
     volume, or a quarter of the unknowns if that is less)

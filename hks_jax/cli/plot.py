@@ -20,7 +20,7 @@ from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import sliced
 from hks_jax.cli.values import parse_times
 from hks_jax.io.result import Result
-from hks_jax.signatures.suitable import RESOLVED
+from hks_jax.signatures.times import RESOLVED
 
 OPTIONS = """
 result RESULT  the result, as an .npz or the folder of a signature
@@ -32,7 +32,7 @@ result RESULT  the result, as an .npz or the folder of a signature
 --range R = own
     range of the colours: own for each image (default) or shared by all images, at least 1 % of the values; or two
     numbers LOW,HIGH (write --range=LOW,HIGH if LOW is negative)
---quantiles Q,Q = 0,1  quantiles of the values at the ends of own and shared ranges
+--quantiles Q,Q = 0,1  quantiles of the values at the two ends of an own or shared range of colours
 --cmap NAME = viridis  colour map of matplotlib
 --scaled  draw (4πt)^(d/2)·HKS, which is 1 for flat space (with --normalisation flat, this is always drawn)
 --unit TEXT  unit of t

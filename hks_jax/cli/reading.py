@@ -110,7 +110,7 @@ def _without_filling(volume: TensorVolume, background: str | None, progress: Pro
     if found is None:
         return volume
     if background is None:
-        progress.warn(f"{found[1]}. Pass --mask, or --background outside, or inside to include these voxels")
+        progress.warn(f"{found[1]}. Pass --mask or --background outside, or --background inside to include them")
         return volume
     note = found[1].replace("count as inside", "are left out, as asked")
     return replace(volume.with_mask(~found[0]), notes=(*volume.notes, note))
@@ -142,4 +142,4 @@ def _repaired(volume: TensorVolume, args: argparse.Namespace) -> TensorVolume:
     if args.repair is None:
         return volume
     volume = repair_tensors(volume, *args.repair)
-    return volume if volume.repair["voxels"] else replace(volume, notes=(*volume.notes, "repair: no tensor needs it"))
+    return volume if volume.repair["voxels"] else replace(volume, notes=(*volume.notes, "repair: none was needed"))

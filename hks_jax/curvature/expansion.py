@@ -56,16 +56,14 @@ def hks_expansion(
     finite differences of sixth order, which are one-sided near the sides of a grid and the rim of a mask. There u₂ is
     of fourth order and u₃ of second order in the spacing h, measured as a length. For the machine precision ε, the
     relative rounding error of u₃ is about ε(t/h²)³/5, and a hundred times larger within eight nodes of a side or rim.
-    In float32 keep t below 30 h², or the order below 3.
+    In float32 keep t below 30 h², or the order below 3. The result is NaN outside the mask, and where no stencil fits
+    into it.
 
     Args:
         field: the metric, d = 2 or 3.
         times: (n_times,) positive times, in length².
         order: the highest power of t in brackets, 0 … 3 on a surface, 0 … 2 in three dimensions; None is the highest.
         periodic: whether the axes are periodic; one value for all axes, or one per axis.
-
-    Returns:
-        The expansion (n_times, *shape) in 1/lengthᵈ; NaN outside the mask, and where no stencil fits into the mask.
 
     Raises:
         ValueError: times that are not a vector of positive numbers; an order that is not implemented; fewer than 8

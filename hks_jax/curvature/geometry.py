@@ -1,4 +1,4 @@
-"""Curvature of a metric, and the Laplace–Beltrami operator of a function, at the nodes of a grid."""
+"""Curvature of a metric, and the Laplace–Beltrami operator applied to a function, at the nodes of a grid."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -30,14 +30,11 @@ def scalar_curvature(field: TensorField, periodic: bool | Sequence[bool] = False
     """Return the scalar curvature R of a metric at the nodes; on a surface R = 2K for the Gaussian curvature K.
 
     If the field was made from a function, R is exact, from JAX derivatives. Otherwise it is from finite differences of
-    sixth order of the nodal tensors (see `gaussian_curvature`).
+    sixth order of the nodal tensors, and NaN as in `gaussian_curvature`.
 
     Args:
         field: the metric, d = 2 or 3.
-        periodic: whether the axes are periodic (node n is node 0), one value for all or one per axis.
-
-    Returns:
-        The curvature (*shape) in 1/length²; NaN outside the mask, and where no stencil fits into the mask.
+        periodic: as in `gaussian_curvature`.
 
     Raises:
         ValueError: fewer than 8 nodes along an axis of a nodal field; a bad `periodic`.
@@ -54,15 +51,11 @@ def gaussian_curvature(field: TensorField, periodic: bool | Sequence[bool] = Fal
     """Return the Gaussian curvature K of a two-dimensional metric at the nodes.
 
     If the field was made from a function, K is exact, from JAX derivatives. Otherwise it is from finite differences of
-    sixth order of the nodal tensors, which are one-sided near the edges of the grid and the mask.
+    sixth order of the nodal tensors, which are one-sided near the edges of the grid and the mask. K is NaN outside the
+    mask, and where no stencil of 7 nodes along a grid line fits into it (8 for a second derivative near an edge).
 
     Args:
-        field: the metric, d = 2.
         periodic: whether the axes are periodic (node n is node 0), one value for all or one per axis.
-
-    Returns:
-        The curvature (*shape) in 1/length². It is NaN outside the mask, and where no stencil of 7 nodes along a grid
-        line fits into the mask (8 nodes for a second derivative near an edge).
 
     Raises:
         ValueError: a field that is not two-dimensional; fewer than 8 nodes along an axis of a nodal field; a bad
@@ -158,15 +151,12 @@ def laplace_beltrami(
     """Return ∇²f = div grad f = (1/√g) ∂ₐ(√g gᵃᵇ ∂ᵦf) at the nodes, negative at a peak of f (geometers' −Δf).
 
     Derivatives of functions, be it the metric or `f`, are exact. Derivatives of nodal values are finite differences of
-    sixth order (see `gaussian_curvature`).
+    sixth order, and NaN as in `gaussian_curvature`.
 
     Args:
         field: the metric, d = 2 or 3.
         f: nodal values (*shape), or a function from coordinates (d,) to a number, differentiable by JAX.
-        periodic: whether the axes are periodic, one value for all or one per axis.
-
-    Returns:
-        The values (*shape) in units of f/length²; NaN outside the mask, and where no stencil fits into the mask.
+        periodic: as in `gaussian_curvature`.
 
     Raises:
         ValueError: values of another shape; fewer than 8 nodes along an axis with differences; a bad `periodic`.

@@ -77,11 +77,11 @@ def checked_mask(
     kept = inside[cells].all(axis=1) if len(inside) == n_vertices else inside
     if len(inside) == len(cells) and (kept != inside).any():
         raise ValueError(
-            f"mask: got {n_vertices} values, but there are as many {words.argument} as vertices, and it may belong to "
-            f"either; to mask {words.argument}, pass {words.argument}[mask] and a mask that is True for each vertex"
+            f"mask: got {n_vertices} values for {n_vertices} vertices and as many {words.argument}, which is "
+            f"ambiguous; to mask {words.argument}, pass {words.argument}[mask] and a mask that is True everywhere"
         )
     if not kept.any():
-        raise ValueError(f"mask: {int(inside.sum())} of {inside.size} are inside, but no {words.simplex} is")
+        raise ValueError(f"mask: {int(inside.sum())} of {inside.size} vertices are inside, but no {words.simplex}")
     return kept
 
 

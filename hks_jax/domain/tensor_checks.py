@@ -64,8 +64,8 @@ def require_spd(
         of_grids = f"{_MASK}, or raise their eigenvalues (hks_jax.io.repair_tensors)"
         if bad.sum() > MANY * inside.sum():
             of_grids = (
-                "So many cannot be noise. If the tensors are indefinite by nature, such as stress, make a metric by "
-                f"hks_jax.TensorField.from_indefinite. {_MASK}, if they are outside the domain"
+                "Noise does not explain this number. If the tensors are indefinite by nature, such as stress, make "
+                f"a metric by hks_jax.TensorField.from_indefinite. {_MASK}, if they are outside the domain"
             )
         refuse(name, bad, inside, place, what, of_grids if place == "node" else "Raise their eigenvalues")
 
@@ -120,8 +120,8 @@ def right_cauchy_green(name: str, grid: Grid, F: Any) -> Float[Array, "*shape d 
     if shape != grid.shape or n != d or m < d:
         expected = (*grid.shape, d, d)
         raise ValueError(
-            f"{name}: got shape {gradients.shape}; expected (*grid.shape, d, d) = {expected}, one gradient per node, "
-            "or more rows than columns for a map into a space of more dimensions"
+            f"{name}: got shape {gradients.shape}; expected one gradient per node, (*grid.shape, d, d) = {expected}. "
+            "For a map into a space of more dimensions, gradients have more rows than columns"
         )
     if m == d and not is_traced(gradients):
         known = np.asarray(gradients, np.float64)
@@ -176,7 +176,7 @@ def positive_map(
     if known:
         require_finite_symmetric(name, np.asarray(tensors), inside, place)
         values = np.linalg.eigvalsh(np.asarray(tensors, np.float64)[inside])
-        got = f"number: got the {NUMBERS[how]} {float(number):g} of {name}"
+        got = f"number: got the {NUMBERS[how]} {float(number):g} for {name}"
         if how == "shift" and not float(number) + values.min() > 0:
             raise ValueError(
                 f"{got} whose least eigenvalue is {values.min():g}; expected more than {-values.min():g}, so that "

@@ -5,13 +5,12 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
-from hks_jax.compilation import known_here
+from hks_jax.compilation import is_concrete_on_cpu
 from hks_jax.eigen.complement.factorised_adjoint import FactorisedAdjoint
-from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.filter.chebyshev_filter import ChebyshevFilter
 from hks_jax.eigen.host.shift_invert import ShiftInvert
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
-from hks_jax.eigen.solver import Eigensolver
+from hks_jax.eigen.solver import Dense, Eigensolver
 from hks_jax.fem.pencil import AnyPencil, Pencil
 from hks_jax.fem.stencil import StencilOperator
 
@@ -22,23 +21,11 @@ SOLVERS: dict[str, Callable[[], Eigensolver]] = {
 _SMALL = 1500
 """The largest number of unknowns for which the dense solver is chosen. It takes O(n³) time and misses no eigenvalue."""
 
-# Times in seconds of the first call in a process, which includes compilation, and of later calls, on two cores
-# (benchmarks/first_answer/automatic.py). "ours": the Chebyshev filter on grids in 3D or in float32, else block Lanczos.
-#
-#                            float64                         float32
-#   nodes/pairs   n·k        shift-invert   ours             shift-invert   ours
-#   64²/50        0.2 M      2.1    0.2      5.7    0.1      2.2    0.2      6.7    0.1
-#   64²/200       0.8 M      3.0    0.9      6.3    0.3      2.9    0.8      6.9    0.4
-#   128²/100      1.6 M      4.4    2.0      7.1    0.6      3.7    1.9      12     1.3
-#   256²/100      6.6 M      13     9.2      8.4    2.4      13     9.1      16     3.9
-#   16³/50        0.2 M      4.1    0.6      11     0.5      4.3    0.6      8.8    0.2
-#   24³/100       1.4 M      9.8    5.4      10     2.1      8.7    5.7      9.5    0.7
-#   surface/50    0.2 M      1.8    0.2      6.7    0.2      1.7    0.2      6.1    0.3    (4096 vertices)
-#   surface/100   1.6 M      3.5    1.9      7.1    0.7      3.1    1.7      9.5    2.0    (16 384 vertices)
-#
-# Compilation takes about five seconds for any size. So up to n·k = 5 million no solver is the fastest both in the first
-# and in later calls. The choice minimises the larger of the two factors lost, except for small volumes in float32.
-# Block Lanczos in float32 also factorises in float32. So it searches repeatedly, and some pairs do not converge.
+# Shift-invert competes with "ours": the Chebyshev filter on grids in 3D or in float32, else block Lanczos. Ours takes
+# about five seconds to compile at any size. So up to n·k = 5 million no solver is the fastest both in the first and in
+# later calls. The choice minimises the larger of the two factors lost (benchmarks/first_answer/automatic.py), except
+# for small volumes in float32. Block Lanczos in float32 also factorises in float32. So it searches repeatedly, and some
+# pairs do not converge.
 _LARGE, _LARGE_IN_SINGLE = 800_000, 5_000_000
 """The least n·k for which a solver in JAX is chosen. The second value is for 2D grids in single precision."""
 
@@ -78,7 +65,7 @@ def _automatic(pencil: Pencil, k: int) -> Eigensolver:
     n, volume = pencil.space.n_dof, pencil.space.dimension == 3
     if n <= _SMALL or 4 * k > n:
         return Dense()
-    known = known_here(jax.lax.stop_gradient((pencil.stiffness, pencil.mass)))
+    known = is_concrete_on_cpu(jax.lax.stop_gradient((pencil.stiffness, pencil.mass)))
     if not (pencil.measured and pencil.bounded):
         ours = BlockLanczos() if k < BlockLanczos().max_pairs(n) else Dense()
         return ShiftInvert() if known and n * k < _LARGE else ours

@@ -1,6 +1,5 @@
 """Derivatives of eigenpairs, the lowest or the first above an origin, with respect to stiffness and mass."""
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal
 
@@ -8,15 +7,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.compilation import by_numpy, jit_quickly, known_and_few, numpy_where_known
-from hks_jax.eigen.complement.adjoint import Adjoint, unsolved
+from hks_jax.compilation import jit_quickly, numpy_where_known
+from hks_jax.eigen.complement.adjoint import Adjoint, OfRows, Rows, Scalar, Values, Vectors, unsolved
 from hks_jax.eigen.complement.factorised_adjoint import InteriorAdjoint
 from hks_jax.eigen.lanczos.block_lanczos import first_from_origin
 from hks_jax.eigen.quality import indistinct
-from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
+from hks_jax.eigen.solver import Eigensolver, RawPairs, Report
 from hks_jax.fem.pencil import AnyPencil, Pencil
 from hks_jax.linear import lapack
 from hks_jax.linear.linear_map import first_order_only, with_transpose
@@ -26,28 +25,17 @@ from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import inner_products, matmul
 from hks_jax.traced import is_traced
 
-Telling = Literal["nothing", "warning", "error"]
+OnFailure = Literal["nothing", "warning", "error"]
 """The action if the linear solves of a derivative do not converge, in addition to the result NaN."""
 
 _ON_HOST = 1 << 23
 """The largest size of the eigenvectors for which NumPy differentiates, as fast as JAX and without compilation."""
 
-Lowest = tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, "k n_dof"]]
-Followed = tuple[
-    Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, "k n_dof"], Float[Array, ""], Float[Array, ""]
-]
-
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 2, 3, 4, 5, 6))
 def solved(
-    solver: Eigensolver,
-    pencil: SymmetricPencil,
-    k: int,
-    extra: int,
-    interior: bool,
-    throw: bool,
-    report: Report = silent,
-) -> Followed:
+    solver: Eigensolver, pencil: SymmetricPencil, k: int, extra: int, interior: bool, throw: bool, report: Report
+) -> tuple[Values, Vectors, Vectors, Scalar, Scalar]:
     """Return k eigenvalues, their eigenvectors, the frame (the same vectors), the next eigenvalue, and a bound.
 
     The pairs are the lowest or, if ``interior``, the first above the origin of a `LocatedPencil`. The derivative of the
@@ -82,36 +70,23 @@ def solved(
 # over j > k, which is the same for every basis of the first k eigenvectors (hks_jax/signatures/spectral_functions.py).
 @solved.defjvp
 def _solved_jvp(
-    solver: Eigensolver,
-    k: int,
-    extra: int,
-    interior: bool,
-    throw: bool,
-    report: Report,
-    primals: tuple[SymmetricPencil],
-    changes: tuple[SymmetricPencil],
-) -> tuple[Followed, Followed]:
+    solver: Eigensolver, k: int, extra: int, interior: bool, throw: bool, report: Report, primals: Any, changes: Any
+) -> tuple[tuple, tuple]:
     pencil, change = first_order_only(primals[0]), changes[0]
     n_dof, sides = pencil.size, 2 if interior else 1
     spare = max(extra, min(sides * solver.guards(k, n_dof), min(solver.max_pairs(n_dof), n_dof) - k))
     values, vectors, complete_below = _computed(solver, pencil, k, spare, interior, report)
     adjoint = InteriorAdjoint(solver.adjoint.tolerance) if interior else solver.adjoint
-    quiet = is_traced(primals) or adjoint.warns
-    telling: Telling = "error" if throw else "nothing" if quiet else "warning"
-    prepared = prepare(adjoint, k, pencil, values)
+    # Many products with one Jacobian share what is prepared.
+    prepared = one_by_one(_prepare, (adjoint, k), pencil, values) if _solves(pencil, k, len(values)) else None
+    if isinstance(pencil, Pencil) and pencil.metric is not None:
+        # Reverse mode stores all arrays of the arguments, but only estimates need the metric.
+        pencil = eqx.tree_at(lambda p: p.metric, pencil, None)
+    on_failure: OnFailure = "error" if throw else "nothing" if is_traced(primals) else "warning"
     eigenvalues, functions, following = _cut(values, vectors, k)
-    known = prepared, _matrices(pencil), change, values, vectors, functions
-    tangents = tangents_of(adjoint, telling, *known)
+    tangents = tangents_of(adjoint, on_failure, prepared, pencil, change, values, vectors, functions)
     constants = following if extra else jnp.full_like(following, jnp.inf), complete_below
     return (eigenvalues, functions, functions, *constants), (*tangents, *map(jnp.zeros_like, constants))
-
-
-# Reverse mode stores all arrays of the arguments, even unused ones.
-def _matrices(pencil: SymmetricPencil) -> SymmetricPencil:
-    """Return the pencil without its metric, which only estimates need."""
-    if not isinstance(pencil, Pencil) or pencil.metric is None:
-        return pencil
-    return eqx.tree_at(lambda p: p.metric, pencil, None)
 
 
 def _computed(
@@ -121,7 +96,8 @@ def _computed(
     if interior:
         return one_by_one(first_from_origin, (solver, k, spare, report), pencil)
     values, vectors, bound = one_by_one(_lowest, (solver, k + spare, report), pencil)
-    values, vectors = _exact_null_modes(pencil, values, vectors) if pencil.n_null else (values, vectors)
+    if pencil.null_space is not None and pencil.n_null:
+        values, vectors = _with_null_modes(pencil.mass, pencil.null_space.vectors, values, vectors)
     return values, vectors, bound
 
 
@@ -131,26 +107,19 @@ def _cut(xp: Any, values: Any, vectors: Any, k: int) -> tuple[Any, Any, Any]:
     return values[:k], vectors[:k], values[k] if len(values) > k else xp.asarray(xp.inf, values.dtype)
 
 
-# A separate function, so that many products with one Jacobian share its result.
-def prepare(adjoint: Adjoint, k: int, pencil: SymmetricPencil, values: Float[Array, " p"]) -> Any:
-    """Call the adjoint's `prepare` for the first k of p computed pairs; return None if no linear solve is needed."""
-    return one_by_one(_prepare, (adjoint, k), pencil, values) if _solves(pencil, k, len(values)) else None
-
-
 def _solves(pencil: SymmetricPencil, k: int, p: int) -> bool:
     """Return whether derivatives of the first k of p pairs have components along other eigenvectors."""
     return p < pencil.size and pencil.n_fixed < k
 
 
 def _shapes(*args: Any) -> tuple[Any, Any, Any]:
-    """Return the shapes and dtypes of the tangents."""
     functions = args[-1]
     return jax.ShapeDtypeStruct((len(functions),), functions.dtype), functions, functions
 
 
 def _numpy_rule(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
     """Return the tangents or, given cotangents y, the cotangents of the change, by NumPy."""
-    adjoint, telling, prepared, pencil, _, *pairs = known
+    adjoint, on_failure, prepared, pencil, _, *pairs = known
     values, vectors, functions = map(np.asarray, pairs)
     if vectors.size > _ON_HOST or x is None:
         return None
@@ -162,9 +131,10 @@ def _numpy_rule(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> A
         if not _solves(pencil, k, len(values)):
             return np.zeros_like(rhs)
         free = np.arange(k)[:, None] >= pencil.n_fixed
-        solution = np.asarray(_solve(adjoint, prepared, pencil, *pairs[:2], jax.device_put(np.where(free, rhs, 0))))
+        given = prepared, pencil, *pairs[:2], jax.device_put(np.where(free, rhs, 0))
+        solution = np.asarray(adjoint.solve(*given))
         if np.isnan(solution).any():
-            _told(telling, jax.device_put(solution))
+            _checked(on_failure, jax.device_put(solution))
         return np.where(free, solution, 0)
 
     def onto(force: np.ndarray) -> np.ndarray:
@@ -185,9 +155,7 @@ def _numpy_rule(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> A
     return change_of(change, functions, force, moved)
 
 
-def change_of(
-    change: SymmetricPencil, x: Float[np.ndarray, "b n_dof"], *p: Float[np.ndarray, "b n_dof"]
-) -> SymmetricPencil:
+def change_of(change: SymmetricPencil, x: Rows, *p: Rows) -> SymmetricPencil:
     """Return the cotangent of the change: Σ pxᵀ for stiffness and mass, each with its own p, and zeros elsewhere."""
     zeros = jax.tree.map(lambda like: jax.device_put(np.zeros(like.shape, like.dtype)), change)
     matrices = tuple(matrix.outer(each, x) for matrix, each in zip((zeros.stiffness, zeros.mass), p, strict=True))
@@ -203,22 +171,21 @@ def _gaps(xp: Any, values: Any, k: int, rounding: Any) -> tuple[Any, Any]:
 
 
 # Without the checkpoint, reverse mode would store copies of the eigenvectors.
-@jit_quickly(static_argnames=("adjoint", "telling"), linear=("change",), shapes=_shapes, numpy_rule=_numpy_rule)
+@jit_quickly(static_argnames=("adjoint", "on_failure"), linear=("change",), shapes=_shapes, numpy_rule=_numpy_rule)
 @partial(jax.checkpoint, static_argnums=(0, 1))
 def tangents_of(
     adjoint: Adjoint,
-    telling: Telling,
+    on_failure: OnFailure,
     prepared: Any,
     pencil: SymmetricPencil,
     change: SymmetricPencil,
-    values: Float[Array, " p"],
-    vectors: Float[Array, "p n_dof"],
-    functions: Float[Array, "k n_dof"],
-) -> Lowest:
+    values: Values,
+    vectors: Vectors,
+    functions: Rows,
+) -> tuple[OfRows, Rows, Rows]:
     """Return dλ, dφ and the derivative of the frame for the first k of p computed pairs.
 
-    ``prepared`` is the result of `prepare` for the pairs in this order. ``functions`` are the first k vectors again,
-    which saves a copy.
+    ``prepared`` is the result of `Adjoint.prepare`. ``functions`` are the first k vectors again, which saves a copy.
     """
     k = len(functions)
     eigenvalues, guards = values[:k], vectors[k:]
@@ -228,49 +195,23 @@ def tangents_of(
     # The guards have a separate product, because reverse mode of the frame needs only this one.
     into = inner_products(functions, force)
     within = jnp.where(apart[:, :k], inverse[:, :k] * into, -inner_products(functions, moved) / 2)
-    frame = _onto(guards, inverse[:, k:], force)
+
+    # This symmetric map is its own transpose. The transpose derived by JAX would be several times slower.
+    def onto_guards(force: Rows) -> Rows:
+        return matmul(inverse[:, k:] * inner_products(guards, force), guards)
+
+    def solve(_: object, rhs: Rows) -> Rows:
+        return _checked(on_failure, one_by_one(type(adjoint).solve, (adjoint,), prepared, pencil, values, vectors, rhs))
+
+    frame = with_transpose(onto_guards, onto_guards, force)
     if _solves(pencil, k, len(values)):
-        frame = frame + _outside(adjoint, telling, prepared, pencil, values, vectors, -force)
-    d_vectors = matmul(within, functions) + frame
-    return jnp.diagonal(into), d_vectors, frame
-
-
-# This symmetric map is its own transpose. The transpose derived by JAX would be several times slower.
-def _onto(
-    guards: Float[Array, "g n_dof"], factors: Float[Array, "k g"], force: Float[Array, "k n_dof"]
-) -> Float[Array, "k n_dof"]:
-    """Return Σⱼ cᵢⱼ (gⱼ·fᵢ) gⱼ."""
-
-    def onto(force: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
-        return matmul(factors * inner_products(guards, force), guards)
-
-    return with_transpose(onto, onto, force)
-
-
-def _outside(
-    adjoint: Adjoint,
-    telling: Telling,
-    prepared: Any,
-    pencil: SymmetricPencil,
-    values: Float[Array, " p"],
-    vectors: Float[Array, "p n_dof"],
-    rhs: Float[Array, "k n_dof"],
-) -> Float[Array, "k n_dof"]:
-    """Solve (K − λᵢM) xᵢ = Q rhsᵢ on the complement of the p computed eigenvectors."""
-    shifts, n_fixed = values[: len(rhs), None], pencil.n_fixed
-
-    def matvec(x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
-        return pencil.stiffness.apply(x) - shifts * pencil.mass.apply(x)
-
-    def solve(_: object, b: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
-        return _told(telling, one_by_one(_solve, (adjoint,), prepared, pencil, values, vectors, b))
-
-    # The force is zero on null vectors that every perturbation annihilates. In reverse mode, these rows are cotangents;
-    # then their solutions are set to zero.
-    def moved(x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
-        return jnp.where(np.arange(len(x))[:, None] < n_fixed, 0, x)
-
-    return moved(jax.lax.custom_linear_solve(matvec, moved(rhs), solve, symmetric=True))
+        # The force is zero on null vectors that every perturbation annihilates. In reverse mode, these rows are
+        # cotangents; then their solutions are set to zero. JAX would need the product with the matrix, here the
+        # identity, only for second derivatives.
+        free = np.arange(k)[:, None] >= pencil.n_fixed
+        rhs = jnp.where(free, -force, 0)
+        frame = frame + jnp.where(free, jax.lax.custom_linear_solve(lambda x: x, rhs, solve, symmetric=True), 0)
+    return jnp.diagonal(into), matmul(within, functions) + frame, frame
 
 
 # `one_by_one` needs the same function object in every call; so these are module functions, not methods.
@@ -278,20 +219,16 @@ def _lowest(solver: Eigensolver, k: int, report: Report, pencil: SymmetricPencil
     return solver.lowest(pencil, k, report)
 
 
-def _prepare(adjoint: Adjoint, k: int, pencil: SymmetricPencil, values: Float[Array, " p"]) -> Any:
+def _prepare(adjoint: Adjoint, k: int, pencil: SymmetricPencil, values: Values) -> Any:
     return adjoint.prepare(pencil, values, k)
 
 
-def _solve(adjoint: Adjoint, *args: Any) -> Float[Array, "k n_dof"]:
-    return adjoint.solve(*args)
-
-
-def _told(telling: Telling, x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
+def _checked(on_failure: OnFailure, x: Rows) -> Rows:
     """Return x; if rows of x are NaN, warn or raise."""
     failed = jnp.sum(jnp.any(jnp.isnan(x), axis=1))
-    if telling == "error":
+    if on_failure == "error":
         return eqx.error_if(x, failed > 0, unsolved("some", len(x)))
-    if telling == "warning":
+    if on_failure == "warning":
 
         def warn(failed: Array | np.ndarray) -> np.ndarray:
             if failed:
@@ -302,41 +239,21 @@ def _told(telling: Telling, x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof
     return x
 
 
-def _exact_null_modes(
-    pencil: SymmetricPencil, values: Float[Array, " k"], vectors: Float[Array, "k n_dof"]
-) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"]]:
+@numpy_where_known(jit_quickly())
+def _with_null_modes(xp: Any, mass: Any, nulls: Any, values: Any, vectors: Any) -> tuple[Any, Any]:
     """Replace the solver's approximations of the null vectors by the known null vectors.
 
     Their eigenvalue becomes exactly 0 instead of about ±1e-13. Other vectors become orthogonal to the null vectors.
     """
-    if not known_and_few((pencil.mass, values, vectors)):
-        return _exact_by_jax(pencil, values, vectors)
-    assert pencil.null_space is not None
-    mass = pencil.mass.to_scipy()
-
-    def inverse_cholesky(matrix: np.ndarray) -> np.ndarray:
-        return np.linalg.inv(np.linalg.cholesky(matrix))
-
-    by_scipy = partial(_with_null_modes, np, lambda rows: (mass @ rows.T).T, inverse_cholesky)
-    return by_numpy(by_scipy, pencil.null_space.vectors, values, vectors)
-
-
-@jit_quickly()
-def _exact_by_jax(
-    pencil: SymmetricPencil, values: Float[Array, " k"], vectors: Float[Array, "k n_dof"]
-) -> tuple[Float[Array, " k"], Float[Array, "k n_dof"]]:
-    assert pencil.null_space is not None
-    # The barrier prevents XLA from folding long constants during compilation.
-    nulls = jax.lax.optimization_barrier(pencil.null_space.vectors)
-    return _with_null_modes(jnp, pencil.mass.apply, lapack.inverse_cholesky, nulls, values, vectors)
-
-
-def _with_null_modes(
-    xp: Any, mass: Callable[[Any], Any], inverse_cholesky: Callable[[Any], Any], nulls: Any, values: Any, vectors: Any
-) -> tuple[Any, Any]:
-    product = np.matmul if xp is np else partial(jnp.matmul, precision="highest")
+    product: Any
+    inverse_cholesky: Any
+    if xp is jnp:
+        product, inverse_cholesky = matmul, lapack.inverse_cholesky
+        nulls = jax.lax.optimization_barrier(nulls)  # else XLA would fold long constants during compilation
+    else:
+        product, inverse_cholesky = np.matmul, lambda gram: np.linalg.inv(np.linalg.cholesky(gram))
     nulls = nulls[: values.size]
-    image = mass(nulls)
+    image = (mass @ nulls.T).T
     lengths = xp.sqrt(xp.sum(nulls * image, axis=1, keepdims=True))
     nulls, image = nulls / lengths, image / lengths
     orthonormal = inverse_cholesky(product(nulls, image.T))
@@ -349,9 +266,7 @@ def _with_null_modes(
 
 
 @jax.custom_jvp
-def frame_of_chosen(
-    vectors: Float[Array, "k n_dof"], mass: Operator, chosen: Bool[Array, " k"]
-) -> Float[Array, "k n_dof"]:
+def frame_of_chosen(vectors: Rows, mass: Operator, chosen: Bool[Array, " k"]) -> Rows:
     """Return the vectors, whose derivative excludes rotations among the chosen ones (a frame of the chosen vectors).
 
     A frame of all vectors would also exclude rotations towards vectors that are not chosen.
@@ -368,20 +283,15 @@ def _frame_of_chosen_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]
 
 
 # The transpose derived by JAX would multiply by the transposed vectors, which takes twice as long.
-def products_with_constants(images: Float[Array, "b n_dof"], vectors: Float[Array, "k n_dof"]) -> Float[Array, "b k"]:
+def products_with_constants(images: Float[Array, "b n_dof"], vectors: Rows) -> Float[Array, "b k"]:
     """Return the inner products, for derivatives linear in the images; the vectors are constants."""
     return with_transpose(partial(inner_products, vectors), lambda mix: matmul(mix, vectors), images)
 
 
 @jax.custom_jvp
 def of_simple(
-    vectors: Float[Array, "k n_dof"],
-    values: Float[Array, " k"],
-    following: Float[Array, ""],
-    kept: Bool[Array, " k"],
-    part: Int[Array, " k"] | None,
-    pencil: AnyPencil,
-) -> Float[Array, "k n_dof"]:
+    vectors: Rows, values: OfRows, following: Scalar, kept: Bool[Array, " k"], part: Any, pencil: AnyPencil
+) -> Rows:
     """Return the vectors. Their nonzero derivatives become NaN unless the eigenvalue is simple and kept."""
     return vectors
 
@@ -395,17 +305,14 @@ def _of_simple_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     rounding = [indistinct(each, values.dtype) for each in pencil.parts]
     multiple = _is_multiple(values, following, kept, part, rounding, pencil.parts[0].n_fixed > 0)
 
-    def undefined(x: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
-        counts = jnp.any(x != 0, axis=1)
-        return jnp.where((multiple & counts)[:, None], jnp.nan, x)
+    def undefined(x: Rows) -> Rows:
+        return jnp.where((multiple & jnp.any(x != 0, axis=1))[:, None], jnp.nan, x)
 
     return vectors, with_transpose(undefined, undefined, tangents[0])
 
 
 @numpy_where_known(static_argnums=5)
-def _is_multiple(
-    xp: Any, values: Any, following: Any, kept: Any, part: Any | None, rounding: list[Any], fixed: bool
-) -> Any:
+def _is_multiple(xp: Any, values: Any, following: Any, kept: Any, part: Any, rounding: Any, fixed: bool) -> Any:
     """Return the mask (k) of pairs that are not kept, cut by k, or mixed with an equal eigenvalue by perturbations."""
     size = xp.maximum(xp.abs(values), values - values[:1])
     least = xp.maximum(xp.finfo(values.dtype).eps ** 0.5 * size, xp.max(xp.stack(rounding)))

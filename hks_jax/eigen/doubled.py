@@ -9,12 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.derivative import frame_of_chosen
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.one_pencil import solve_lowest, widened
-from hks_jax.eigen.solver import Eigensolver, Report, Status
-from hks_jax.eigen.weyl import weyl, weyl_number
+from hks_jax.eigen.solver import Dense, Eigensolver, Report, Status
 from hks_jax.fem.pencil import MirrorPencil
 from hks_jax.traced import is_traced
 
@@ -24,13 +22,15 @@ def solve_doubled(
 ) -> Eigenpairs:
     """Solve all parts and return the k lowest pairs of the merged spectrum; ``extra`` = 1 adds the next eigenvalue.
 
-    The number of pairs from each part is not known beforehand. If values are concrete, the first guess is Weyl's law
-    plus a margin, doubled for every part that may still miss a pair; otherwise the upper bound is used.
+    The number of pairs from each part is not known beforehand. If values are concrete, the first guess is an equal
+    share plus a margin, doubled for every part that may still miss a pair; otherwise the upper bound is used. By Weyl's
+    law, the boundary conditions of the parts change their shares by about the square root of the total.
     """
     parts, total = pencil.parts, k + extra
     whole, limits = widened(pencil, solvers, total), _limits(pencil, total)
     traced = is_traced(jax.lax.stop_gradient(pencil))
-    wanted = limits if traced else [*map(min, limits, _shares(pencil, total))]
+    share = math.ceil(total / len(parts)) + 2 * math.isqrt(total) + 4
+    wanted = limits if traced else [min(limit, share) for limit in limits]
     # For a small part, all of its pairs may be needed, which an iterative solver cannot compute.
     solvers = [
         solver if limit <= solver.max_pairs(part.size) else Dense(solver.tolerance)
@@ -72,17 +72,6 @@ def _of_problem(report: Report, number: int, of: int) -> Report:
         report(Status(f"problem {number + 1} of {of}: {text}", left))
 
     return tell
-
-
-# In units of the spacing, a part's volume is its number of nodes. If a rim of r nodes has the Dirichlet condition in
-# place of the natural one, the length or area in Weyl's second term changes by −2r.
-def _shares(pencil: MirrorPencil, total: int) -> list[int]:
-    """Return an estimate, plus a margin, of the number of pairs that each part contributes."""
-    d, sizes = pencil.space.dimension, [part.space.n_dof for part in pencil.parts]
-    mean = sum(sizes) / len(sizes)
-    share, margin = total / len(sizes), 2 * math.isqrt(total) + 4
-    value = weyl(share, mean, d)
-    return [max(math.ceil(share + weyl_number(value, 0.0, d, 2 * (size - mean))), 0) + margin for size in sizes]
 
 
 @partial(jax.jit, static_argnames=("k", "extra"))

@@ -8,7 +8,6 @@ import numpy as np
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.eigen.automatic import choose_solver
-from hks_jax.eigen.dense import Dense
 from hks_jax.eigen.derivative import of_simple
 from hks_jax.eigen.doubled import merge, solve_doubled
 from hks_jax.eigen.eigenpairs import RESULTS, SPARE, Eigenpairs, MultipletChoice, truncate
@@ -16,7 +15,7 @@ from hks_jax.eigen.host.shift_invert import ShiftInvert
 from hks_jax.eigen.inertia import checked_pencil
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
 from hks_jax.eigen.one_pencil import Interval, checked_interval, solve_interval, solve_lowest, widened
-from hks_jax.eigen.solver import Eigensolver, Report, silent
+from hks_jax.eigen.solver import Dense, Eigensolver, Report, silent
 from hks_jax.fem.assembly import MassKind
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.elements import Quadrature
@@ -130,11 +129,11 @@ def eigsh(
     pairs; then ``.result`` is not successful. For the largest eigenvalues, negate K; for interior eigenvalues, give the
     interval. A ``LinearOperator`` is not accepted, because K and M are factorised (by nested dissection).
 
-    First derivatives with respect to the entries of K and M are available in forward and reverse mode. At any
-    multiplicity, derivatives of signatures and of sums over all equal eigenvalues are exact. The derivative of an
-    eigenvector is NaN if its eigenvalue is multiple; so use `spectral_signature`, not your own Σᵢ f(λᵢ) φᵢ(x)². The
-    function works under `jit`, and under `vmap` over the entries of one pattern (map over a pencil from
-    `sparse_pencil`). Derivatives in an interval keep its ends fixed.
+    First derivatives with respect to the entries of K and M are available in forward and reverse mode. For eigenvalues
+    of any multiplicity, derivatives of signatures are exact, and of sums over all copies of an eigenvalue. The
+    derivative of an eigenvector is NaN if its eigenvalue is multiple; so use `spectral_signature`, not your own Σᵢ
+    f(λᵢ) φᵢ(x)². The function works under `jit`, and under `vmap` over the entries of one pattern (map over a pencil
+    from `sparse_pencil`). Derivatives in an interval keep its ends fixed.
 
     Args:
         K: a symmetric (n, n) matrix: a SciPy sparse matrix, a BCOO or BCSR of `jax.experimental.sparse`, an operator of
@@ -193,7 +192,7 @@ def _in_interval(
     report: Report,
 ) -> Eigenpairs:
     if len(pencil.parts) > 1 and k is not None:
-        raise ValueError(f"k: got {k} with an interval of a doubled domain, whose parts are counted apart; leave k out")
+        raise ValueError(f"k: got {k} with an interval of a doubled domain, which has two separate counts; leave k out")
     checked = [checked_interval(part, interval, k) for part in jax.lax.stop_gradient(pencil).parts]
     solvers = [_for_interval(solver, part, each) for part, each in zip(pencil.parts, checked, strict=True)]
     traced = is_traced([each.below for each in checked])

@@ -129,9 +129,8 @@ class Eigenpairs(eqx.Module):
     @property
     def null_space_known(self) -> bool:
         """Whether the pairs are the lowest, and the pencils' null spaces are known."""
-        if self.pencil is None:  # pairs inside a fit have no pencil; fits are for fields, whose null spaces are known
-            return self.lowest
-        return self.lowest and all(part.null_space is not None for part in self.pencil.parts)
+        # Pairs inside a fit have no pencil; fits are for fields, whose null spaces are known.
+        return self.lowest and (self.pencil is None or all(part.null_space is not None for part in self.pencil.parts))
 
     @property
     def n_null(self) -> int:
@@ -194,7 +193,7 @@ class Eigenpairs(eqx.Module):
         sentences, last = [], values[kept - 1]
         if bad.any():
             missing, worst = int(np.isnan(values).sum()), np.nanmax(np.asarray(self.residuals)[bad], initial=0.0)
-            found = f", worst relative residual of the others {worst:.1e}" if missing < bad.sum() else ""
+            found = f"; the worst relative residual of those found is {worst:.1e}" if missing < bad.sum() else ""
             better = "" if values.dtype == np.float64 else "float64, "
             sentences.append(
                 f"{int(bad.sum())} of {values.size} eigenpairs did not converge ({missing} of them not found{found}) "
@@ -224,7 +223,7 @@ class Eigenpairs(eqx.Module):
     def summary(self) -> str:
         """Describe size, method, range and quality in a few lines. Needs concrete values."""
         if not self.k:
-            return "no eigenpairs: there are none in the interval"
+            return "no eigenpairs: the interval contains no eigenvalue"
         values, residuals = np.asarray(self.eigenvalues), np.asarray(self.residuals)
         kept, following = int(np.asarray(self.kept).sum()), float(self.next_eigenvalue)
         last = float(self.last_eigenvalue)

@@ -121,7 +121,6 @@ def count_below(pencil: AnyPencil, below: Scalar | float) -> Number:
 
 
 def _total(pencil: AnyPencil, shift: Scalar) -> Count:
-
     counts = [certain_count(part, shift) for part in pencil.parts]
     return sum((count for count, _ in counts), jnp.zeros((), int)), jnp.all(jnp.stack([sound for _, sound in counts]))
 
@@ -160,7 +159,6 @@ class _Descent(NamedTuple):
     near: Scalar  # the largest distance so far that has at most the allowed number of eigenvalues; 0 at first
     number: Number  # the number of eigenvalues within `near`
     far: Scalar  # the least distance so far that has too many eigenvalues; ∞ at first
-    far_number: Number  # the number of eigenvalues within `far`
     next: Scalar  # the next distance to count at
     tries: Number  # the number of counts so far
     going: Flag  # whether the search goes on
@@ -179,7 +177,7 @@ def lowered(pencil: LocatedPencil, most: int, probes: int) -> tuple[Scalar, Numb
 
     nothing, none = jnp.zeros((), dtype), jnp.zeros((), int)
     first, going = 3 / 4 * most * pencil.spacing, (pencil.negative > 0) & (most > 0)
-    start = _Descent(nothing, none, nothing + jnp.inf, none, first, none, going)
+    start = _Descent(nothing, none, nothing + jnp.inf, first, none, going)
     state = while_loop(lambda state: state.going, step, start)
     return state.near, state.number
 
@@ -189,15 +187,13 @@ def _descended(state: _Descent, count: Number, sound: Flag, negative: Number, sp
     passed = negative - count
     nearer, farther = sound & (passed <= most), sound & (passed > most)
     near, number = jnp.where(nearer, state.next, state.near), jnp.where(nearer, passed, state.number)
-    far, far_number = jnp.where(farther, state.next, state.far), jnp.where(farther, passed, state.far_number)
-    share = (3 * most // 4 - number) / jnp.maximum(far_number - number, 1)
-    between = near + jnp.clip(share.astype(near.dtype), 1 / 8, 7 / 8) * (far - near)
-    following = jnp.where(jnp.isfinite(far), between, 4 * near)
+    far = jnp.where(farther, state.next, state.far)
+    following = jnp.where(jnp.isfinite(far), (near + far) / 2, 4 * near)
     # If the count is uncertain, count at a slightly larger distance.
     following = jnp.where(sound, following, state.next + 1e-2 * (jnp.minimum(far, 2 * state.next) - state.next))
     few, narrow = (2 * number < most) & (number < negative), far - near <= _ALIKE * jnp.maximum(near, spacing)
     tries = state.tries + 1
-    return _Descent(near, number, far, far_number, following, tries, few & ~narrow & (tries < _TRIES))
+    return _Descent(near, number, far, following, tries, few & ~narrow & (tries < _TRIES))
 
 
 class _Search(NamedTuple):

@@ -11,16 +11,15 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from hks_jax.checks import require_count
-from hks_jax.compilation import by_numpy, jit_quickly, known_and_few, known_here
-from hks_jax.eigen.complement.adjoint import Scalar, Values, Vectors
-from hks_jax.eigen.dense import Dense
+from hks_jax.compilation import is_concrete_on_cpu, jit_quickly, numpy_where_known
+from hks_jax.eigen.complement.adjoint import Scalar
 from hks_jax.eigen.derivative import frame_of_chosen, solved
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.host.shift_invert import ShiftInvert, lower_bound
 from hks_jax.eigen.inertia import certain_count, count_below, locate, translated
 from hks_jax.eigen.lanczos.block_lanczos import SLICE, BlockLanczos, known_by_weyl
-from hks_jax.eigen.quality import allowed_residuals, indistinct, largest, measure_pairs, measured_on_host
-from hks_jax.eigen.solver import Eigensolver, Report
+from hks_jax.eigen.quality import allowed_residuals, indistinct, largest_of, measure_pairs, measured_on_host
+from hks_jax.eigen.solver import Dense, Eigensolver, Report
 from hks_jax.fem.nodal import on_all_nodes
 from hks_jax.fem.pencil import AnyPencil, Pencil
 from hks_jax.linear.pencil import SymmetricPencil, tabulated
@@ -38,7 +37,7 @@ def widened(pencil: AnyPencil, solvers: Sequence[Eigensolver], k: int) -> AnyPen
 def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw: bool, report: Report) -> Eigenpairs:
     """Return the k lowest pairs; with ``extra`` = 1 also the next eigenvalue. See `solved` for ``throw``."""
     n_dof = pencil.size
-    if isinstance(solver, ShiftInvert) and not pencil.bounded and known_here(jax.lax.stop_gradient(pencil)):
+    if isinstance(solver, ShiftInvert) and not pencil.bounded and is_concrete_on_cpu(jax.lax.stop_gradient(pencil)):
         bound = lower_bound(jax.lax.stop_gradient(pencil))
         pencil = eqx.tree_at(lambda p: p.lower_bound, pencil, bound, is_leaf=lambda leaf: leaf is None)
     if not (pencil.bounded or solver.indefinite):
@@ -81,9 +80,10 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
 
     moved, found = solve(origin, reach, spacing)
     values = jax.lax.stop_gradient(found[0])
-    if not is_traced(values) and _is_far(moved, values):
-        # Solve again from an origin nearer to the spectrum, because distances from a remote origin lose digits.
-        spread = values[-1] - values[0]
+    spread = values[-1] - values[0]
+    if not is_traced(values) and spread > indistinct(moved, values.dtype) and values[0] > _FAR * spread:
+        # Solve again from an origin nearer to the spectrum, because distances from a remote origin lose digits; equal
+        # eigenvalues have none to lose.
         origin = origin + values[0] - spread
         moved, found = solve(origin, 2 * spread, spread / number)
     if number > k:
@@ -91,12 +91,6 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
         frame = frame_of_chosen(vectors[:k], pencil.mass, jnp.ones(k, bool))
         found = values[:k], vectors[:k], frame, jax.lax.stop_gradient(values[k]), bound
     return _pairs(pencil, moved, origin, found, method)
-
-
-def _is_far(pencil: SymmetricPencil, values: Values) -> bool:
-    """Return whether eigenvalues lose digits because their origin is remote; equal eigenvalues have none to lose."""
-    spread = values[-1] - values[0]
-    return bool((spread > indistinct(pencil, values.dtype)) & (values[0] > _FAR * spread))
 
 
 class Interval(NamedTuple):
@@ -150,8 +144,8 @@ def checked_interval(pencil: Pencil, interval: tuple[float, float], k: int | Non
     available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if needed > available:
         raise ValueError(
-            f"interval: got one with {count} eigenpairs, which need about {needed / 1e9:.3g} GB; the machine has "
-            f"{available / 1e9:.3g} GB. Divide the interval"
+            f"interval: got an interval of {count} eigenpairs, which need about {needed / 1e9:.3g} GB; the machine "
+            f"has {available / 1e9:.3g} GB. Divide the interval"
         )
     return Interval(low, high, below, held, count)
 
@@ -166,9 +160,15 @@ def _pairs(
 ) -> Eigenpairs:
     """Return the `Eigenpairs` of a pencil, given the pairs of the pencil translated to an origin."""
     values, vectors, frame, following, bound = found
-    held = jax.lax.stop_gradient((tabulated(solved_pencil), values, vectors))
     known = solved_pencil is pencil and pencil.null_space is not None
-    residuals, converged, zero, tolerance = _quality(*held, origin, solver.tolerance, known)
+    if values.size:
+        matrices = tabulated(SymmetricPencil(solved_pencil.stiffness, solved_pencil.mass))
+        held = jax.lax.stop_gradient((matrices, values, vectors, origin))
+        quality = _quality(*held, solved_pencil.n_null, solver.tolerance, known)
+    else:
+        no = jnp.zeros(0, bool)
+        quality = jnp.zeros(0, values.dtype), no, no, jnp.asarray(1e-6, values.dtype)
+    residuals, converged, zero, tolerance = quality
     # While differentiating, JAX may turn a constant array into a Python number.
     following, bound = jnp.asarray(following), jnp.asarray(bound)
     if not known:
@@ -193,40 +193,18 @@ def _pairs(
     )
 
 
+@numpy_where_known(jit_quickly(static_argnames=("n_null", "tolerance", "known")), most=3 << 18)
 def _quality(
-    pencil: SymmetricPencil, values: Values, vectors: Vectors, origin: Scalar, tolerance: float, known: bool
-) -> tuple[Array, ...]:
-    """Return residuals, convergence flags, flags of zero eigenvalues, and the multiplet tolerance."""
-    k = values.size
-    if k == 0:
-        return jnp.zeros(0, values.dtype), *[jnp.zeros(0, bool)] * 2, jnp.asarray(1e-6, values.dtype)
-    if not known_and_few((pencil.stiffness, values, vectors)):
-        return _judged_by_jax(pencil, values, vectors, origin, tolerance, known)
-
-    def by_scipy(values: np.ndarray, vectors: np.ndarray, origin: np.ndarray) -> tuple[Any, ...]:
-        measured = measured_on_host(pencil, vectors, values)
-        return _judged(np, measured, values, origin, pencil.n_null, tolerance, known)
-
-    return by_numpy(by_scipy, values, vectors, origin)
-
-
-@jit_quickly(static_argnames=("tolerance", "known"))
-def _judged_by_jax(
-    pencil: SymmetricPencil, values: Values, vectors: Vectors, origin: Scalar, tolerance: float, known: bool
-) -> tuple[Array, ...]:
-    measured = *measure_pairs(pencil, vectors, values)[1:], largest(pencil)
-    return _judged(jnp, measured, values, origin, pencil.n_null, tolerance, known)
-
-
-def _judged(
-    xp: Any, measured: tuple[Any, Any, Any], values: Any, origin: Any, n_null: int, tolerance: float, known: bool
+    xp: Any, pencil: Any, values: Any, vectors: Any, origin: Any, n_null: int, tolerance: float, known: bool
 ) -> tuple[Any, ...]:
-    """Return the result of `_quality`, given the measurements of the pairs.
+    """Return residuals, convergence flags, flags of zero eigenvalues, and the multiplet tolerance.
 
     Residuals are relative to the distance of the eigenvalue from the origin. This distance is bounded below by the
     first positive eigenvalue if the null space is known, otherwise by the mean gap; if all are zero, by the size of K.
     """
-    (residuals, twice, size), k = measured, values.size
+    measure = measured_on_host if xp is np else measure_pairs
+    (_, residuals, twice), k = measure(pencil, vectors, values), values.size
+    size = largest_of(xp, pencil.stiffness, pencil.mass)
     rounding = 4 * xp.finfo(values.dtype).eps * size
     zero = xp.abs(values + origin) <= rounding
     unit = values[min(n_null, k - 1)] if known else xp.where(xp.all(zero), size, (values[-1] - values[0]) / k)

@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hks_jax.compilation import by_numpy, known_and_few
-from hks_jax.linear.operators import Operator
+from hks_jax.compilation import numpy_where_known
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import products_with_columns, row_blocks
 
@@ -52,17 +51,17 @@ def measure_pairs(
 
 
 def measured_on_host(
-    pencil: SymmetricPencil, vectors: Float[np.ndarray, "m n_dof"], values: Float[np.ndarray, " m"]
-) -> tuple[np.ndarray, np.ndarray, Any]:
-    """Return ‖Kφ − λMφ‖ / ‖Mφ‖, whether a vector nearly repeats an earlier vector, and `largest`; by SciPy."""
-    stiffness, mass = (matrix.to_scipy().tocsr() for matrix in (pencil.stiffness, pencil.mass))
+    pencil: Any, vectors: Float[np.ndarray, "m n_dof"], values: Float[np.ndarray, " m"]
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
+    """Return the result of `measure_pairs` for a pencil of SciPy matrices; vectors are compared with all before."""
     columns = np.ascontiguousarray(vectors.T)
-    image = mass @ columns
-    residuals = np.linalg.norm(stiffness @ columns - image * values, axis=0) / np.linalg.norm(image, axis=0)
+    image = pencil.mass.tocsr() @ columns
+    force = pencil.stiffness.tocsr() @ columns
+    residuals = np.linalg.norm(force - image * values, axis=0) / np.linalg.norm(image, axis=0)
     twice = np.zeros(len(values), bool)
     if vectors.dtype == np.float32:
         twice = np.any(np.abs(np.tril(vectors @ image, -1)) > _ALIKE, axis=1)
-    return residuals, twice, _largest(np, stiffness.diagonal(), mass.diagonal())
+    return values, residuals, twice
 
 
 def allowed_residuals(scale: Any, rounding: Any, tolerance: float, xp: Any = jnp) -> Any:
@@ -81,16 +80,12 @@ def indistinct(pencil: SymmetricPencil, dtype: np.dtype) -> Float[Array, ""]:
 
 def largest(pencil: SymmetricPencil) -> Float[Array, ""]:
     """Estimate the largest eigenvalue by 4·max|Kᵢᵢ/Mᵢᵢ|, which is λ_max on a uniform grid in 2D and 3D."""
-    matrices = pencil.stiffness, pencil.mass
-    if not known_and_few(matrices):
-        return _largest_by_jax(*matrices)
-    return by_numpy(lambda: _largest(np, *(matrix.to_scipy().diagonal() for matrix in matrices)))
+    return _largest(pencil.stiffness, pencil.mass)
 
 
-@jax.jit
-def _largest_by_jax(stiffness: Operator, mass: Operator) -> Float[Array, ""]:
-    return _largest(jnp, stiffness.diagonal(), mass.diagonal())
+def largest_of(xp: Any, stiffness: Any, mass: Any) -> Any:
+    """Return the result of `largest` for matrices of JAX or SciPy."""
+    return 4 * xp.max(xp.abs(stiffness.diagonal()) / mass.diagonal())
 
 
-def _largest(xp: Any, stiffness: Any, mass: Any) -> Any:
-    return 4 * xp.max(xp.abs(stiffness) / mass)
+_largest = numpy_where_known()(largest_of)

@@ -1,10 +1,10 @@
 """Weyl's law: estimates of eigenvalue counts from the volume of a domain and the measure of its boundary."""
 
 import math
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from hks_jax.checks import require_real
 from hks_jax.domain.components import wrap_nodes
@@ -15,17 +15,14 @@ from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.pencil import AnyPencil
 from hks_jax.fem.space import FunctionSpace, GridSpace, MeshSpace
 
-Real = TypeVar("Real", float, Float[np.ndarray, " n"])
-Volume = TypeVar("Volume", float, Float[Array, ""])
 
-
-def weyl(count: float, volume: Volume, dimension: int) -> Volume:
+def weyl(count: float, volume: Any, dimension: int) -> Any:
     """Estimate the eigenvalue with the index ``count``, by the first term of `weyl_number`."""
     constant = 4 * math.pi if dimension == 2 else (6 * math.pi**2) ** (2 / 3)
     return constant * (count / volume) ** (2 / dimension)
 
 
-def weyl_number(values: Real, volume: float, dimension: int, rim: float = 0.0) -> Real:
+def weyl_number(values: Any, volume: float, dimension: int, rim: float = 0.0) -> Any:
     """Estimate the number of eigenvalues below λ ≥ 0. ``rim``: natural minus Dirichlet measure of the rim."""
     if dimension == 2:
         return (volume * values + rim * values**0.5) / (4 * math.pi)
@@ -61,9 +58,9 @@ def weyl_count(
     d = pencil.space.dimension
     volume = pencil.volume if pencil.measured else None
     if volume is None:
-        raise ValueError("problem: got one without dimension or volume; give them to `sparse_pencil` for Weyl's law")
+        raise ValueError("problem: got matrices without dimension or volume; give these to `sparse_pencil`")
     if any(part.metric is not None and part.null_space is None for part in pencil.parts):
-        raise ValueError("problem: got one with a potential, which Weyl's law omits; use `count_eigenvalues`")
+        raise ValueError("problem: got an operator with a potential, which Weyl's law omits; use `count_eigenvalues`")
     require_real("values", values)
     numbers = np.asarray(values, np.float64)
     if not (np.isfinite(numbers) & (numbers >= 0)).all():
@@ -83,10 +80,16 @@ def weyl_count(
 
 def rim_measure(domain: TensorField | SimplicialMesh, space: FunctionSpace) -> float:
     """Return the metric length (area in 3D) of the natural part of the rim minus that of the Dirichlet part."""
-    if isinstance(domain, SimplicialMesh):
-        return _mesh_rim(domain, space)
-    assert isinstance(space, GridSpace)
-    return sum(_grid_rim(domain, space, axis) for axis in range(space.dimension))
+    if not isinstance(domain, SimplicialMesh):
+        assert isinstance(space, GridSpace)
+        return sum(_grid_rim(domain, space, axis) for axis in range(space.dimension))
+    d, triangulation = space.dimension, domain.triangulation
+    cell, corner = np.divmod(triangulation.boundary_facets, d + 1)
+    corners = np.concatenate([np.zeros((1, d)), np.eye(d)])[FACETS[d][corner]]  # in the basis of the cell's edges
+    steps = corners[:, 1:] - corners[:, :1]
+    gram = np.einsum("fia,fab,fjb->fij", steps, np.asarray(domain.metric, np.float64)[cell], steps)
+    measure = float(np.sqrt(np.linalg.det(gram)).sum()) / math.factorial(d - 1)
+    return -measure if "dirichlet" in space.boundary[0] else measure
 
 
 def _grid_rim(field: TensorField, space: GridSpace, axis: int) -> float:
@@ -112,14 +115,3 @@ def _grid_rim(field: TensorField, space: GridSpace, axis: int) -> float:
     for end, condition in zip((0, -1), space.boundary[axis], strict=True):
         sign[end] = -1 if condition == "dirichlet" else 1
     return float(faces @ sign)
-
-
-def _mesh_rim(mesh: SimplicialMesh, space: FunctionSpace) -> float:
-    """Return the signed measure of the facets that belong to exactly one cell."""
-    d, triangulation = space.dimension, mesh.triangulation
-    cell, corner = np.divmod(triangulation.boundary_facets, d + 1)
-    corners = np.concatenate([np.zeros((1, d)), np.eye(d)])[FACETS[d][corner]]  # in the basis of the cell's edges
-    steps = corners[:, 1:] - corners[:, :1]
-    gram = np.einsum("fia,fab,fjb->fij", steps, np.asarray(mesh.metric, np.float64)[cell], steps)
-    measure = float(np.sqrt(np.linalg.det(gram)).sum()) / math.factorial(d - 1)
-    return -measure if "dirichlet" in space.boundary[0] else measure

@@ -5,7 +5,6 @@ from functools import partial
 from typing import Any, Literal, get_args
 
 import numpy as np
-from jaxtyping import Array
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import require_count
@@ -13,12 +12,11 @@ from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.boundary import BoundarySpec, doubled_problems, normalise_boundary
 from hks_jax.fem.elements import Quadrature
-from hks_jax.fem.fields import Field, checked_field
+from hks_jax.fem.fields import checked_field
 from hks_jax.fem.forms import Form, WeakForm, l2, laplace_beltrami
-from hks_jax.fem.grid_assembly import assemble_grid, grid_points
-from hks_jax.fem.mesh_assembly import assemble_mesh, mesh_nodes, mesh_points
+from hks_jax.fem.integrals import assemble_grid, assemble_mesh, grid_points, mesh_nodes, mesh_points
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
-from hks_jax.fem.space import GridSpace, MeshSpace, grid_space, mesh_space
+from hks_jax.fem.space import grid_space, mesh_space
 from hks_jax.linear.operators import PatternedOperator, require_symmetric
 from hks_jax.traced import is_traced
 
@@ -104,13 +102,14 @@ def assemble(
         raise ValueError(f'quadrature: got {quadrature!r}; expected "gauss" or "cancelling"')
     if quadrature == "cancelling":
         for what, is_given in (
-            ("a mesh, for which no such points are known", isinstance(domain, SimplicialMesh)),
-            ("a lumped mass, for which no such points exist", operator.lumped),
+            ("a mesh, for which no cancelling points are known", isinstance(domain, SimplicialMesh)),
+            ("a lumped mass, for which no cancelling points exist", operator.lumped),
             ("your own form, whose error is not known", operator.own),
         ):
             if is_given:
                 raise ValueError(f'quadrature: got "cancelling" with {what}; expected "gauss"')
         operator = operator._replace(cancelling=True)
+    nodes = None
     if isinstance(domain, SimplicialMesh):
         if boundary not in MESH_BOUNDARIES:
             raise ValueError(f"boundary: got {boundary!r}; expected one of {', '.join(map(repr, MESH_BOUNDARIES))}")
@@ -118,48 +117,45 @@ def assemble(
         nodes = mesh_nodes(domain, degree, midpoints)
         if degree == 2 and operator.lumped:
             raise ValueError(
-                'mass: got "lumped" with degree=2; row sums at the vertices are not positive. Use "consistent"'
+                'mass: got "lumped" with degree=2, where row sums at the vertices are not positive. Use "consistent"'
             )
         spaces: list[Any] = [mesh_space(domain.triangulation, each, degree) for each in conditions]
-        points = partial(mesh_points, nodes, spaces[0])
+        points, dtype = partial(mesh_points, nodes, spaces[0]), nodes.dtype
         at_vertices = (domain.triangulation.n_vertices,)
         given = {
             name: value if callable(value) or np.shape(value)[:1] == at_vertices else domain.restrict(value)
             for name, value in given.items()
         }
-        held = _checked_fields(operator, given, spaces[0], points, nodes.dtype)
-        operator = operator._replace(checked=not (operator.own and is_traced((domain, held, nodes))))
-        curved = midpoints is not None
-        pencils = [assemble_mesh(domain, nodes, held, each, operator, curved) for each in spaces]
-        if curved and not is_traced(pencils) and np.isnan(pencils[0].mass.diagonal()).any():
-            raise ValueError(
-                "midpoints: got positions that fold or invert cells; move them closer to the straight edges"
+        pencil_on: Callable[..., Pencil] = partial(assemble_mesh, domain, nodes, midpoints is not None)
+    else:
+        if not isinstance(domain, TensorField):
+            raise TypeError(f"domain: got {type(domain).__name__}; expected a TensorField, a SurfaceMesh or a TetMesh")
+        if domain._tensors is not None and domain._tensors.ndim > domain.grid.dimension + 2:
+            raise ValueError("domain: got a batch of tensor fields; expected one field. Map over the batch by jax.vmap")
+        if degree != 1 or midpoints is not None:
+            raise ValueError(f"degree, midpoints: got {degree!r} for a grid, whose elements are Q1; leave both out")
+        sides = normalise_boundary(boundary, domain.grid.dimension)
+        if components > 1 and any("mirror" in pair for pair in sides):
+            raise ValueError('boundary: got "mirror" with components; expected a boundary for vector-valued functions')
+        spaces = [grid_space(domain.grid, problem) for problem in doubled_problems(sides)]
+        if any("dirichlet" in pair for pair in sides) and (spaces[0].free == spaces[0].domain).all():
+            where = (
+                "acts on the sides of the grid, which the mask does not reach. For the rim of the mask pass "
+                '"dirichlet-rim"'
+                if sides[-1] == ("neumann", "neumann")
+                else "acts nowhere: there is no mask, and so no rim. Leave this condition out"
             )
-        return _joined(pencils, operator)
-    if not isinstance(domain, TensorField):
-        raise TypeError(f"domain: got {type(domain).__name__}; expected a TensorField, a SurfaceMesh or a TetMesh")
-    if domain._tensors is not None and domain._tensors.ndim > domain.grid.dimension + 2:
-        raise ValueError("domain: got a batch of tensor fields; expected one field. Map over the batch with jax.vmap")
-    if degree != 1 or midpoints is not None:
-        raise ValueError(f"degree, midpoints: got {degree!r} for a grid, whose elements are Q1; leave both out")
-    sides = normalise_boundary(boundary, domain.grid.dimension)
-    if components > 1 and any("mirror" in pair for pair in sides):
-        raise ValueError('boundary: got "mirror" with components; it is for scalar functions only. Use another')
-    problems = doubled_problems(sides)
-    spaces = [grid_space(domain.grid, problem) for problem in problems]
-    space, held = spaces[0], {}
-    if given:
+            warn_of_accuracy(f'boundary: got {boundary!r}, but "dirichlet" {where}')
         dtype = domain.tensors.dtype
-        held = _checked_fields(operator, given, space, partial(grid_points, domain.grid, space, dtype), dtype)
-    operator = operator._replace(checked=not (operator.own and is_traced((domain, held))))
-    pencils = [assemble_grid(domain, held, each, operator) for each in spaces]
-    if any("dirichlet" in conditions for conditions in sides) and (space.free == space.domain).all():
-        where = (
-            'acts on the sides of the grid, which the mask does not reach. For the rim of the mask pass "dirichlet-rim"'
-            if sides[-1] == ("neumann", "neumann")
-            else "acts nowhere: there is no mask, and so no rim. Leave it out"
-        )
-        warn_of_accuracy(f'boundary: got {boundary!r}, but "dirichlet" {where}')
+        points, pencil_on = partial(grid_points, domain.grid, spaces[0], dtype), partial(assemble_grid, domain)
+    known, held = not operator.own, {}
+    for name, value in given.items():
+        settings = {"scalar": known, "positive": known and name == "density"}
+        held[name] = checked_field(name, value, spaces[0], points, dtype, **settings)
+    operator = operator._replace(checked=known or not is_traced((domain, held, nodes)))
+    pencils = [pencil_on(held, each, operator) for each in spaces]
+    if midpoints is not None and not is_traced(pencils) and np.isnan(pencils[0].mass.diagonal()).any():
+        raise ValueError("midpoints: got positions that fold or invert cells; move them closer to the straight edges")
     return _joined(pencils, operator)
 
 
@@ -177,7 +173,7 @@ def _checked_operator(
         raise ValueError(f"stiffness: got {type(stiffness).__name__}; expected a form: a function of u, v and w")
     for name, form in (("stiffness", stiffness), ("mass", mass)):
         if is_traced([cell.cell_contents for cell in getattr(form, "__closure__", None) or ()]):
-            raise ValueError(f"{name}: the form closes over traced values; pass them as fields={{…}}, even numbers")
+            raise ValueError(f"{name}: the form closes over traced values; pass these, also numbers, as fields={{…}}")
     require_count("components", components)
     own, given = stiffness is not None or callable(mass), dict(fields or {})
     named = {name: value for name, value in (("potential", potential), ("density", density)) if value is not None}
@@ -187,21 +183,11 @@ def _checked_operator(
             "the field in the form"
         )
     if (given or components > 1) and not own:
-        raise ValueError("fields, components: got one of them without your own form; pass stiffness= or mass= too")
+        raise ValueError("fields, components: got them without your own form; pass stiffness= or mass= too")
     if components > 1 and stiffness is None:
         raise ValueError("stiffness: got None with components; expected a form for functions with several components")
     of_mass = mass if callable(mass) else l2
     return WeakForm(stiffness or laplace_beltrami, of_mass, mass == "lumped", components, own), given | named
-
-
-def _checked_fields(
-    operator: WeakForm, given: dict[str, Any], space: GridSpace | MeshSpace, points: Callable[[], Array], dtype: Any
-) -> dict[str, Field]:
-    known = not operator.own
-    return {
-        name: checked_field(name, value, space, points, dtype, scalar=known, positive=known and name == "density")
-        for name, value in given.items()
-    }
 
 
 def _joined(pencils: list[Pencil], operator: WeakForm) -> AnyPencil:

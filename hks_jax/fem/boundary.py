@@ -12,8 +12,7 @@ from hks_jax.domain.components import active_elements, element_nodes, rim_nodes
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_field import TensorField
 
-Side: TypeAlias = str
-Sides: TypeAlias = tuple[Side, Side]
+Sides: TypeAlias = tuple[str, str]
 """The conditions at the low and the high side of one axis."""
 BoundarySpec: TypeAlias = str | tuple[str | Sides, ...]
 
@@ -26,12 +25,7 @@ _WHOLE_RIM = {"mean": "mean", "dirichlet-rim": "dirichlet"}
 def normalise_boundary(boundary: BoundarySpec, dimension: int) -> tuple[Sides, ...]:
     """Return the conditions (low, high) of every axis and, as last pair, twice the condition on the rim of a mask.
 
-    Args:
-        boundary: ``"neumann"``, ``"dirichlet"``, ``"mean"``, ``"periodic"``, ``"mirror"`` or ``"dirichlet-rim"``; or a
-            tuple with one entry per axis, which is one of these names except the last, or a pair (low, high) of the
-            first three. A further entry, one of the first three names, is for the rim of a mask. By default the rim
-            has the mean if an axis has it, and is natural otherwise.
-        dimension: the number of axes.
+    `assemble` describes the argument. By default the rim has the mean if an axis has it, and is natural otherwise.
     """
     if isinstance(boundary, str):
         everywhere = _WHOLE_RIM.get(boundary)
@@ -89,14 +83,14 @@ def default_boundary(inside: Bool[np.ndarray, "*shape"]) -> tuple[str, str]:
     elements = active_elements(inside, every_axis)
     free = element_nodes(elements, every_axis) & ~rim_nodes(elements, every_axis)
     if not free[(slice(1, -1),) * inside.ndim].any():  # the Dirichlet problem eliminates the grid's sides, too
-        return "neumann", "the mask is so thin that all of its voxels are on the rim, and the mean needs voxels off it"
+        return "neumann", "the mask is so thin that all voxels are on the rim, but the mean needs inner voxels"
     return "mean", 'the domain has a mask; pass boundary="neumann" for a natural rim'
 
 
 def unreached_sides(inside: Bool[np.ndarray, "*shape"], boundary: BoundarySpec) -> list[str]:
     """Return a warning for each condition on a side of the grid that the mask does not reach."""
     *axes, (rim, _) = normalise_boundary(boundary, inside.ndim)
-    own = 'is natural (Neumann); "dirichlet-rim" and "mean" act on it' if rim == "neumann" else f'has "{rim}"'
+    own = 'is natural, unless you pass "dirichlet-rim" or "mean"' if rim == "neumann" else f'has "{rim}"'
     return [
         f'boundary: "{condition}" has no effect at the {side} side of {name}, which the mask does not reach; '
         f"the rim of the mask {own}"
@@ -129,14 +123,11 @@ def reflect(field: TensorField, width: int) -> TensorField:
     """Extend a field by a strip of its mirror image on every side, as in the paper; `crop` removes the strip.
 
     A reflection is an isometry only if the off-diagonal components across the mirror change sign. So in the strip
-    beyond a side of axis a, Tₐᵦ is negated for b ≠ a.
+    beyond a side of axis a, Tₐᵦ is negated for b ≠ a. The mask, if any, is reflected too.
 
     Args:
         field: the field on a grid of shape (n₁, …).
         width: the strip's width in nodes, 1 … n − 1.
-
-    Returns:
-        The field on the grid of shape (n₁ + 2·width, …); the mask, if any, is reflected too.
 
     Examples:
         >>> wide = hj.reflect(field, 2)

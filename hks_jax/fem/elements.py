@@ -59,11 +59,6 @@ def element_matrices(
     return (stiffness, mass) if form.checked else (symmetric_or_nan(stiffness), symmetric_or_nan(mass))
 
 
-def at_quadrature(nodal: Float[Array, "n d d"], element: Element) -> Float[Array, "q d d"]:
-    """Interpolate nodal tensors to the quadrature points with the element's shape functions."""
-    return jnp.einsum("qn,nab->qab", jnp.asarray(element.values, nodal.dtype), nodal, precision="highest")
-
-
 GAUSS = 1 / math.sqrt(3)
 """The coordinate ξ of the two Gauss points ±ξ on [−1, 1]."""
 
@@ -152,7 +147,7 @@ _LEAST, _GREATEST = 0.01, 1.0
 #     δ = −(1/12) Σ_{a<b} 2Aₐᵦ E(θₐ³θᵦ + θₐθᵦ³) / (Σ_{a≠b} Aₐₐ E θₐ²θᵦ² + Σ_{a<b} Σ_{c≠a,b} 2Aₐᵦ E θₐθᵦθ_c²);
 #
 # δ depends neither on t nor on the size of S. In two dimensions δ = S₁₂²/2(S₁₁S₂₂ + 2S₁₂²), so that ξ² = 2/3 − 4δ is
-# between 0 and 2/3. The denominator is positive: it is the sum over c of E θ_c² times the energy of the other axes.
+# between 0 and 2/3. The denominator is positive: it is the sum over c of E θ_c² times the energy along the other axes.
 #
 # The nodal values of functions of norm 1 are too large by the factor 1 + Σ μθₐ²/2, which `Pencil.read` corrects.
 def stiffness_point(metric: Float[Array, "d d"], spacing: Float[np.ndarray | Array, " d"]) -> Float[Array, ""]:

@@ -27,12 +27,13 @@ def factorise(
     boundary: BoundarySpec = "neumann",
     mass: MassKind = "consistent",
 ) -> FactorisedMatrix:
-    """Factorise A = K − σM, which gives solves, the determinant, the inertia and the diagonal of the inverse.
+    """Factorise A = K − σM for ``.solve(b)``, ``.logdet()``, ``.inertia`` and ``.inverse_diagonal()``.
 
     The matrix A may be indefinite. All results are differentiable with respect to K, M, σ and right-hand sides, in
     forward and reverse mode to any order, under `jit` and `vmap`. The elimination is a multifrontal LDLᵀ along a nested
     dissection, without pivoting across fronts. Its accuracy is tested on random right-hand sides. If small pivots spoil
-    it, the elimination is repeated with these pivots replaced, and solutions are refined iteratively.
+    it, the elimination is repeated with these pivots replaced, and solutions are refined iteratively. If values are
+    traced, results of a singular matrix are NaN, and ``.sound`` is False.
 
     Args:
         domain: a tensor field, a mesh, a pencil, a symmetric sparse matrix K (then M is the identity), or (K, M), as
@@ -40,10 +41,6 @@ def factorise(
         shift: the shift σ.
         boundary: see `assemble`; leave it out for a pencil or matrices.
         mass: likewise.
-
-    Returns:
-        The factorised matrix with ``.solve(b)``, ``.logdet()``, ``.inertia`` and ``.inverse_diagonal()``. If values are
-        traced, results of a singular matrix are NaN, and ``.sound`` is False.
 
     Raises:
         ValueError: a shift that is not a finite number; a singular matrix (with the number of its null vectors); a
@@ -133,17 +130,11 @@ for _unknown in (
 
 
 class _State(eqx.Module):
-    """A factorised operator.
+    """A factorised operator A."""
 
-    Attributes:
-        factor: the factorisation of A or, if A is complex, of the real symmetric matrix of its real and imaginary part.
-        hermitian: whether a complex A is Hermitian and not symmetric; None if A is real.
-        conjugate: whether the state stands for the conjugate of A.
-    """
-
-    factor: FactorisedMatrix
-    hermitian: bool | None = eqx.field(static=True)
-    conjugate: bool = eqx.field(static=True, default=False)
+    factor: FactorisedMatrix  # of A or, if A is complex, of the real symmetric matrix of its real and imaginary part
+    hermitian: bool | None = eqx.field(static=True)  # whether a complex A is Hermitian, not symmetric; None if real
+    conjugate: bool = eqx.field(static=True, default=False)  # whether the state stands for the conjugate of A
 
     def conjugated(self) -> "_State":
         return _State(self.factor, self.hermitian, self.hermitian is not None and not self.conjugate)
@@ -183,7 +174,7 @@ class Multifrontal(lx.AbstractLinearSolver[_State]):
         definite = lx.is_positive_semidefinite(operator) or lx.is_negative_semidefinite(operator)
         if not (lx.is_symmetric(operator) or definite):
             raise ValueError(
-                "operator: it is not known to be symmetric or Hermitian; if it is, add a tag, such as "
+                "operator: got one that is not known to be symmetric or Hermitian; if it is, add a tag, such as "
                 "`lineax.TaggedLinearOperator(operator, lineax.symmetric_tag)`, or use `lineax.LU`"
             )
         if not jnp.issubdtype(jnp.result_type(*jax.tree.leaves(operator.in_structure())), jnp.complexfloating):

@@ -17,16 +17,10 @@ Place = Literal["everywhere", "nodes", "elements", "points"]
 
 
 class Field(eqx.Module):
-    """A field on the elements of a domain.
+    """A field on the elements of a domain."""
 
-    Attributes:
-        values: one value for the domain, or values at the nodes (*node_shape, …), on the elements (*elements, …), or at
-            the quadrature points of each element (*elements, q, …).
-        at: the kind of places that have a value; static.
-    """
-
-    values: Float[Array, "..."]
-    at: Place = eqx.field(static=True)
+    values: Float[Array, "..."]  # (…), (*node_shape, …), (*elements, …), or (*elements, q, …) at quadrature points
+    at: Place = eqx.field(static=True)  # the kind of places that have a value
 
     def at_points(
         self, corners: Callable[[Array], Array], shape_values: Float[np.ndarray, "q n"], elements: tuple[int, ...]
@@ -71,7 +65,20 @@ def checked_field(
         raise ValueError(f"{name}: got shape {values.shape}; expected one number at each place: {_expected(space)}")
     trailing = tuple(range(values.ndim - rest, values.ndim))
     if not is_traced(values):
-        _check(name, np.asarray(values), at, inside, trailing, positions, positive)
+        numbers, counted = np.asarray(values), np.ones((), bool) if inside is None else inside
+        wrong, what, remedy = counted & ~np.isfinite(numbers).all(axis=trailing), "NaN or infinite", "Replace"
+        if positive and not wrong.any():
+            wrong, what, remedy = counted & ~(numbers > 0), "not positive", "Raise"
+        if wrong.any():
+            first = tuple(int(i) for i in np.argwhere(wrong)[0])
+            where = f"{at[:-1]} {first if len(first) > 1 else first[0]}" if first else "each place"
+            if at == "points":
+                where = f"x = {np.asarray(positions())[first].round(6).tolist()}"
+            number = "" if trailing else f"{numbers[first]:.6g} "
+            raise ValueError(
+                f"{name}: {int(wrong.sum())} of {int(counted.sum())} values are {what} (the first is {number}at "
+                f"{where}). {remedy} them, or exclude these places by a mask"
+            )
     values = values.astype(dtype)
     if positive:
         values = jnp.where(values > 0, values, jnp.nan)
@@ -107,32 +114,4 @@ def _expected(space: FunctionSpace) -> str:
     return (
         f"{space.node_shape}, one per node, {space.elements.shape}, one per element, a number, or a function of "
         "position"
-    )
-
-
-def _check(
-    name: str,
-    values: np.ndarray,
-    at: Place,
-    inside: Bool[np.ndarray, "..."] | None,
-    trailing: tuple[int, ...],
-    positions: Callable[[], Array],
-    positive: bool,
-) -> None:
-    counted = np.ones((), bool) if inside is None else inside
-    finite = np.isfinite(values).all(axis=trailing)
-    wrong, what = counted & ~finite, "NaN or infinite"
-    if positive and not wrong.any():
-        wrong, what = counted & ~(values > 0), "not positive"
-    if not wrong.any():
-        return
-    first = tuple(int(i) for i in np.argwhere(wrong)[0])
-    where = f"{at[:-1]} {first if len(first) > 1 else first[0]}" if first else "each place"
-    if at == "points":
-        where = f"x = {np.asarray(positions())[first].round(6).tolist()}"
-    number = "" if trailing else f"{values[first]:.6g} "
-    remedy = "Raise" if positive and what == "not positive" else "Replace"
-    raise ValueError(
-        f"{name}: {int(wrong.sum())} of {int(counted.sum())} values are {what} (the first is {number}at {where}). "
-        f"{remedy} them, or exclude these places by a mask"
     )

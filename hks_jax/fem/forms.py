@@ -16,31 +16,19 @@ from hks_jax.linear.operators import ROUNDING
 
 
 class ShapeFunction(NamedTuple):
-    """A shape function at a point.
+    """A shape function at a point."""
 
-    Attributes:
-        value: its value, (), or (c,) for c components.
-        grad: (d,) its derivatives with respect to the coordinates x; or (c, d) with ``grad[i, j]`` = ∂uᵢ/∂xⱼ.
-    """
-
-    value: Float[Array, "*c"]
-    grad: Float[Array, "*c d"]
+    value: Float[Array, "*c"]  # its value, (), or (c,) for c components
+    grad: Float[Array, "*c d"]  # its derivatives by the coordinates x, (d,); or (c, d) with ``grad[i, j]`` = ∂uᵢ/∂xⱼ
 
 
 class Point(eqx.Module):
-    """A point with the metric and the fields there.
+    """A point with the metric and the fields there; on a surface in space, the tensors act on the tangent plane."""
 
-    Attributes:
-        metric: (d, d) the tensor T.
-        inverse: (d, d) its inverse; on a surface in space, T and its inverse act on the tangent plane.
-        x: (d,) the position: coordinates on a grid, a point in space on a mesh. None for the package's own forms.
-        fields: the values of the user's fields; ``w["name"]`` reads one.
-    """
-
-    metric: Float[Array, "*q d d"]
-    inverse: Float[Array, "*q d d"]
-    x: Float[Array, "*q m"] | None
-    fields: Mapping[str, Array]
+    metric: Float[Array, "*q d d"]  # the tensor T
+    inverse: Float[Array, "*q d d"]  # its inverse
+    x: Float[Array, "*q m"] | None  # coordinates on a grid, a point in space on a mesh, None for the package's forms
+    fields: Mapping[str, Array]  # the values of the user's fields; ``w["name"]`` reads one
 
     def __getitem__(self, name: str) -> Array:
         """Return a field at this point."""
@@ -71,25 +59,15 @@ def _weighted(density: Array, w: Point) -> Array:
 
 
 class WeakForm(NamedTuple):
-    """The forms of stiffness and mass, and how they are assembled; static.
-
-    Attributes:
-        stiffness: the form of the stiffness.
-        mass: the form of the mass.
-        lumped: whether the mass becomes the diagonal matrix of its row sums.
-        components: the number of components of a function.
-        own: whether a form is the user's, so that no property of the operator is known.
-        cancelling: whether shape functions are evaluated where the leading error of signatures cancels.
-        checked: whether symmetry can be checked after assembly; otherwise unsymmetric element matrices become NaN.
-    """
+    """The forms of stiffness and mass, and how they are assembled; static."""
 
     stiffness: Form = laplace_beltrami
     mass: Form = l2
-    lumped: bool = False
-    components: int = 1
-    own: bool = False
-    cancelling: bool = False
-    checked: bool = True
+    lumped: bool = False  # whether the mass becomes the diagonal matrix of its row sums
+    components: int = 1  # the number of components of a function
+    own: bool = False  # whether a form is the user's, so that no property of the operator is known
+    cancelling: bool = False  # whether shape functions are evaluated where the leading error of signatures cancels
+    checked: bool = True  # whether symmetry is checked after assembly; otherwise unsymmetric matrices become NaN
 
 
 def of_components(functions: ShapeFunction, components: int) -> ShapeFunction:
@@ -107,10 +85,8 @@ def of_components(functions: ShapeFunction, components: int) -> ShapeFunction:
 def integrate(form: Form, volume: Float[Array, " q"], functions: ShapeFunction, points: Point) -> Float[Array, "n n"]:
     """Integrate a form over one element, for all pairs of n shape functions: value (q, n, *c), grad (q, n, *c, d).
 
-    Each of the q entries of ``volume`` is the weight of a quadrature point times √|T|.
-
-    Raises:
-        ValueError: a form that does not return one number, or that is not linear in u.
+    Each of the q entries of ``volume`` is the weight of a quadrature point times √|T|. A form that does not return one
+    number, or that is not linear in u, raises ValueError.
     """
     read = _reads(form, *(jax.tree.map(lambda leaf: leaf[0], each) for each in (functions, points)))
 

@@ -8,33 +8,36 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
 from hks_jax.traced import is_traced
 
 
-def with_rim(x: Float[Array, "*shape"], periodic: tuple[bool, ...], first: int = 0) -> Float[Array, "*rimmed"]:
-    """Pad x by one node at both ends of the axes from ``first`` on: periodically, or by zeros."""
+def with_rim(x: Any, periodic: tuple[bool, ...], first: int = 0) -> Any:
+    """Pad x (*shape) by one node at both ends of the axes from ``first`` on: periodically, or by zeros."""
+    pad = np.pad if isinstance(x, np.ndarray) else jnp.pad
     for axis, wraps in enumerate(periodic, start=first):
         widths = [(1, 1) if a == axis else (0, 0) for a in range(x.ndim)]
-        x = jnp.pad(x, widths, mode="wrap" if wraps else "constant")
+        x = pad(x, widths, mode="wrap" if wraps else "constant")
     return x
 
 
-def neighbours(x: Float[Array, "*rimmed"], dimension: int) -> Iterator[Float[Array, "*shape"]]:
+def neighbours(x: Any, dimension: int) -> Iterator[Any]:
     """Yield x shifted by each of 3^d offsets along its first d = ``dimension`` axes, along which x is padded."""
     after = (0,) * (x.ndim - dimension)
     shape = [n - 2 if axis < dimension else n for axis, n in enumerate(x.shape)]
     for start in product((0, 1, 2), repeat=dimension):
         start = (*start, *after)
-        yield jax.lax.slice(x, start, [s + n for s, n in zip(start, shape, strict=True)])
+        end = [s + n for s, n in zip(start, shape, strict=True)]
+        yield x[tuple(map(slice, start, end))] if isinstance(x, np.ndarray) else jax.lax.slice(x, start, end)
 
 
 def side_by_side(coefficients: Float[Array, "offsets *shape"]) -> Float[Array, " entries"]:
     """Return the coefficients with those of each node adjacent in memory, which halves the time of a product.
 
-    The result is flat, since XLA would otherwise choose the order of its axes.
+    The result has one axis, because XLA would otherwise choose the memory layout of its axes.
     """
     return jnp.moveaxis(coefficients, 0, -1).reshape(-1)
 
@@ -56,7 +59,7 @@ def product_with_rim(
 
 
 def checked_mesh(mesh: Any) -> Mesh:
-    """Return a mesh of devices with one axis, on which XLA chooses the layout of arrays that have none."""
+    """Return a mesh of devices with one axis. XLA chooses the sharding of arrays for which none is given."""
     if not isinstance(mesh, Mesh) or len(mesh.axis_names) != 1:
         got = f"the axes {mesh.axis_names}" if isinstance(mesh, Mesh) else type(mesh).__name__
         raise ValueError(

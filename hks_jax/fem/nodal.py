@@ -1,6 +1,7 @@
 """The pencil of a grid on all nodes, with masks as arrays, so that all masks share compiled code."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -21,21 +22,13 @@ from hks_jax.traced import is_traced
 
 
 class NodalPencil(eqx.Module):
-    """The matrices K and M on all nodes of a grid, with masks as arrays.
+    """The matrices K and M on all nodes of a grid, with masks as arrays."""
 
-    Attributes:
-        stiffness: K.
-        mass: M; a diagonal if lumped.
-        lumped: (*shape,) the row sums D of M, without derivatives; 1 at nodes that are not free.
-        free: (*shape,) the nodes that carry a degree of freedom.
-        domain: (*shape,) the nodes of the domain: free nodes, and nodes where functions vanish.
-    """
-
-    stiffness: Stencil
-    mass: Stencil
-    lumped: Float[Array, "*shape"]
-    free: Bool[Array, "*shape"]
-    domain: Bool[Array, "*shape"]
+    stiffness: Stencil  # K
+    mass: Stencil  # M; a diagonal if lumped
+    lumped: Float[Array, "*shape"]  # the row sums D of M, without derivatives; 1 at nodes that are not free
+    free: Bool[Array, "*shape"]  # the nodes that carry a degree of freedom
+    domain: Bool[Array, "*shape"]  # the nodes of the domain: free nodes, and nodes where functions vanish
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -156,8 +149,8 @@ def _of_one(pencil: Pencil) -> Pencil:
     sums = pencil.row_sums
     if sums is not None:  # an infinite sum ignores the neighbours
         sums = jnp.where(space.free, space.extend(sums, outside=0.0), jnp.inf).ravel()
-    known_of_it = StencilOperator(of_stiffness, whole), mass, pencil.metric, pencil.volume, whole
-    return Pencil(*known_of_it, null_space=nulls, lower_bound=pencil.lower_bound, row_sums=sums)
+    stiffness = StencilOperator(of_stiffness, whole)
+    return replace(pencil, stiffness=stiffness, mass=mass, space=whole, null_space=nulls, row_sums=sums)
 
 
 # The largest Kᵢᵢ/Mᵢᵢ is a Rayleigh quotient and so at most the largest eigenvalue: the spectrum does not become wider.

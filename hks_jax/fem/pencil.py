@@ -1,5 +1,6 @@
 """The matrix pencil of an operator on a domain with its known properties, and its assembly from elements."""
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any, TypeAlias
 
@@ -87,13 +88,13 @@ class Pencil(SymmetricPencil):
                 "stiffness: got a matrix whose sparsity pattern is not that of the pencil; use `sparse_pencil` for "
                 "matrices of other patterns"
             )
-        return Pencil(stiffness, self.mass, self.metric, self.volume, self.space, row_sums=self.row_sums)
+        return replace(self, stiffness=stiffness, null_space=None, lower_bound=None)
 
     def counted_from(self, origin: Float[Array, ""]) -> "Pencil":
         """Return the pencil of K − σM and M, where σ is a lower bound of the spectrum, without null vectors."""
         moved = self.stiffness.with_flat(self.shifted(origin))
         nothing = NullSpace(jnp.zeros((0, self.size), origin.dtype))
-        return Pencil(moved, self.mass, self.metric, self.volume, self.space, null_space=nothing)
+        return replace(self, stiffness=moved, null_space=nothing, lower_bound=None, row_sums=None)
 
     @property
     def parts(self) -> tuple["Pencil", ...]:
@@ -189,9 +190,8 @@ def assembled(
         bound = _least(fields["potential"], space, operator)
     else:
         nulls = _constants(space, lumped)
-    row_sums = space.restrict(lumped) if operator.cancelling else None
-    known = stiffness, mass, metric, volume, space
-    return Pencil(*known, null_space=nulls, lower_bound=bound, row_sums=row_sums)
+    sums = space.restrict(lumped) if operator.cancelling else None
+    return Pencil(stiffness, mass, metric, volume, space, null_space=nulls, lower_bound=bound, row_sums=sums)
 
 
 # K = A + ∫ρV hᵢhⱼ with A ⪰ 0. If V ≥ v at the quadrature points, then K − vM ⪰ 0 for the mass from the same points. The

@@ -16,35 +16,21 @@ from hks_jax.fem.space import FunctionSpace, GridSpace, MeshSpace, mask_for
 
 
 class SampledMetric(eqx.Module):
-    """The metric from which a pencil was assembled, for error estimates; derivatives treat it as constant.
+    """The metric from which a pencil was assembled, for error estimates; derivatives treat it as constant."""
 
-    Attributes:
-        tensors: (*shape, d, d) at the nodes of a grid; or (n_cells, d, d) in the basis of each mesh cell's edges.
-        spacing: (d,) the spacing of the grid; None on a mesh.
-        interpolation: the interpolation between the nodes.
-    """
-
-    tensors: Float[Array, "*shape d d"]
-    spacing: Float[np.ndarray | Array, " d"] | None
+    tensors: Float[Array, "*shape d d"]  # at the nodes of a grid, or in the basis of the edges of each cell of a mesh
+    spacing: Float[np.ndarray | Array, " d"] | None  # the spacing of the grid; None on a mesh
     interpolation: Interpolation = eqx.field(static=True, default="linear")
 
 
 class Resolution(eqx.Module):
-    """The effect of the spacing on heat kernel signatures to leading order (see `truncation`); not differentiated.
+    """The effect of the spacing on heat kernel signatures to leading order (see `truncation`); not differentiated."""
 
-    Attributes:
-        mesh_width: (*shape) the local distance between neighbouring nodes in the units of the metric.
-        dispersion: (*shape) the number a in the relative bias (a/t)^order for constant tensors, in (metric length)².
-        turning: (*shape) the relative error of every eigenvalue from tensors that rotate or stretch between neighbours.
-        swelling: the relative error of the domain's area or volume.
-        order: 2 if the leading error cancels, else 1.
-    """
-
-    mesh_width: Float[Array, "*shape"]
-    dispersion: Float[Array, "*shape"]
-    turning: Float[Array, "*shape"]
-    swelling: Float[Array, ""]
-    order: int = eqx.field(static=True, default=1, kw_only=True)
+    mesh_width: Float[Array, "*shape"]  # the distance between neighbouring nodes in the units of the metric
+    dispersion: Float[Array, "*shape"]  # a in the relative bias (a/t)^order for constant tensors, in (metric length)²
+    turning: Float[Array, "*shape"]  # the relative error of eigenvalues from tensors that rotate or stretch
+    swelling: Float[Array, ""]  # the relative error of the domain's area or volume
+    order: int = eqx.field(static=True, default=1, kw_only=True)  # 2 if the leading error cancels, else 1
 
 
 def resolution_of(metric: SampledMetric, space: FunctionSpace, lumped: bool, cancelling: bool) -> Resolution:
@@ -89,10 +75,10 @@ def _dispersion(xp: Any, tensors: Any, spacing: Any, lumped: bool, cancelling: b
     return total
 
 
-# Between neighbours along axis a, the flux matrix A = √|T| T⁻¹ changes by δA, and an element averages it. The exact
-# solution u = p·x + w has a corrector w with ∂ₐ(Aₐₐ∂ₐw) = −(∂ₐA eₐ)·p. An element lacks the energy of the corrector,
-# Aₐₐ(∂ₐ²w)² hₐ²/12. If p has the covariance A⁻¹, it is δAeₐ·A⁻¹δAeₐ/12Aₐₐ, relative to the energy of p along one axis.
-# The estimate holds for √t above the length on which A varies; for smaller t only its size is right.
+# Between neighbours along axis a, the flux matrix A = √|T| T⁻¹ changes by δA, and an element uses the mean of A. The
+# exact solution u = p·x + w has a corrector w with ∂ₐ(Aₐₐ∂ₐw) = −(∂ₐA eₐ)·p. An element lacks the energy of the
+# corrector, Aₐₐ(∂ₐ²w)² hₐ²/12. If p has the covariance A⁻¹, it is δAeₐ·A⁻¹δAeₐ/12Aₐₐ, relative to the energy of p along
+# one axis. The estimate holds for √t above the length on which A varies; for smaller t only its size is right.
 def _turning(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...]) -> Any:
     """Return the relative error (*shape) of eigenvalues due to the variation of tensors between neighbours."""
     root = xp.sqrt(spd.determinant(tensors))[..., None, None]

@@ -1,5 +1,6 @@
 """Finite element spaces: their degrees of freedom, their null vectors, and masks for computations."""
 
+import math
 from collections.abc import Sequence
 from functools import cached_property, lru_cache, reduce
 from itertools import product
@@ -10,40 +11,30 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hks_jax.compilation import by_numpy, known_here
+from hks_jax.arrays import ByKey
+from hks_jax.compilation import by_numpy, is_concrete_on_cpu
 from hks_jax.domain.components import active_elements, element_nodes, label_nodes, rim_nodes, wrap_nodes
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.triangulation import Triangulation
 from hks_jax.fem.boundary import Sides
+from hks_jax.fem.halo import neighbours, with_rim
 from hks_jax.traced import is_staged, is_traced
 
 _COPIED = 1 << 22
 """The largest number of values that NumPy copies in less time than a compilation takes."""
 
 
-class FunctionSpace:
-    """The nodes of a domain, and the free nodes, which carry a degree of freedom. Static and hashable.
+class FunctionSpace(ByKey):
+    """The nodes of a domain, and the free nodes, which carry a degree of freedom. Static and hashable."""
 
-    Attributes:
-        node_shape: shape of a nodal array: the grid's shape, or (V,).
-        dimension: the dimension of the manifold.
-        domain: nodes of the domain, bool (*node_shape). Results are NaN elsewhere.
-        free: nodes that carry a degree of freedom, bool (*node_shape). Dirichlet nodes are in the domain, but not free.
-        boundary: the conditions (low, high) of each axis and, last, those on the rim of a mask; for a mesh one pair,
-            such as ``(("neumann", "neumann"),)``.
-        n_components: the number of connected components of the domain.
-        elements: the elements of the domain, bool: n − 1 along each axis of a grid (n if periodic), or all cells.
-    """
-
-    node_shape: tuple[int, ...]
-    dimension: int
-    domain: Bool[np.ndarray, "*node_shape"]
-    free: Bool[np.ndarray, "*node_shape"]
-    boundary: tuple[Sides, ...]
-    n_components: int
-    elements: Bool[np.ndarray, "*elements"]
+    node_shape: tuple[int, ...]  # the shape of a nodal array: the grid's shape, or (V,)
+    dimension: int  # the dimension of the manifold
+    domain: Bool[np.ndarray, "*node_shape"]  # the nodes of the domain; results are NaN elsewhere
+    free: Bool[np.ndarray, "*node_shape"]  # the nodes that carry a degree of freedom; Dirichlet nodes are not free
+    boundary: tuple[Sides, ...]  # the conditions of each axis and of the rim of a mask; for a mesh one pair
+    n_components: int  # the number of connected components of the domain
+    elements: Bool[np.ndarray, "*elements"]  # n − 1 along each axis of a grid (n if periodic), or all cells of a mesh
     _labels: Int[np.ndarray, "*node_shape"]
-    _key: tuple
 
     def __repr__(self) -> str:
         """Return one line: the degrees of freedom, the nodes and the boundary."""
@@ -108,12 +99,6 @@ class FunctionSpace:
         """Return functions of this space as functions of another one on the same nodes, zero at its Dirichlet nodes."""
         return values if to == self else to.restrict(self.extend(values, outside=0.0))
 
-    def __eq__(self, other: object) -> bool:
-        return self is other or (isinstance(other, FunctionSpace) and self._key == other._key)
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
 
 def taken(values: Float[Array, "... n"], indices: Int[np.ndarray, " m"]) -> Float[Array, "... m"]:
     """Return the values at given indices of the last axis."""
@@ -134,7 +119,7 @@ def _spread(
 
 
 def _by_numpy(values: Array) -> bool:
-    return np.size(values) <= _COPIED and known_here(values)
+    return np.size(values) <= _COPIED and is_concrete_on_cpu(values)
 
 
 # The indices are passed as arrays, so that sets of equally many indices share one compilation.
@@ -156,10 +141,6 @@ class GridSpace(FunctionSpace):
     """The Q1 space on a grid with given boundary conditions, as returned by `normalise_boundary`.
 
     Spacing and origin of the grid are not part of the space, so that they can change without recompilation.
-
-    Attributes:
-        inside: the nodes inside the mask, bool (*shape).
-        periodic: for each axis, whether node n is node 0.
     """
 
     def __init__(self, grid: Grid, boundary: tuple[Sides, ...]) -> None:
@@ -192,20 +173,24 @@ class GridSpace(FunctionSpace):
     @cached_property
     def cells(self) -> Int[np.ndarray, "E n"]:
         """The nodes of each element of the domain."""
-        numbers = wrap_nodes(np.arange(self.free.size).reshape(self.node_shape), self.periodic)
-        corners = [numbers[corner] for corner in product(*[(slice(None, -1), slice(1, None))] * self.dimension)]
-        return np.stack(corners, axis=-1)[self.elements]
+        return cells_of(self.elements, self.node_shape, self.periodic)
+
+
+def cells_of(
+    elements: Bool[np.ndarray, "*elements"], shape: tuple[int, ...], periodic: tuple[bool, ...]
+) -> Int[np.ndarray, "E n"]:
+    """Return the nodes of each marked element of a grid, in the order of ``product((0, 1), repeat=d)``."""
+    numbers = wrap_nodes(np.arange(math.prod(shape)).reshape(shape), periodic)
+    corners = product(*[(slice(None, -1), slice(1, None))] * len(shape))
+    return np.stack([numbers[corner] for corner in corners], axis=-1)[elements]
 
 
 @jax.tree_util.register_static
 class MeshSpace(FunctionSpace):
     """The space of P1 or P2 elements on a mesh of triangles or tetrahedra.
 
-    Attributes:
-        triangulation: the connectivity of the mesh.
-        degree: 1 or 2.
-        cells: the nodes of each cell. For degree 2 they are its vertices, then the midpoints of its edges: node
-            ``n_vertices + e`` belongs to edge e of the triangulation.
+    The nodes of a cell are its vertices and, for degree 2, the midpoints of its edges: node ``n_vertices + e`` belongs
+    to edge e of the triangulation.
     """
 
     def __init__(self, triangulation: Triangulation, condition: str, degree: int = 1) -> None:
@@ -228,12 +213,7 @@ class MeshSpace(FunctionSpace):
 
 @jax.tree_util.register_static
 class VectorSpace(FunctionSpace):
-    """Functions with several components on the nodes of another space; results have a last axis of components.
-
-    Attributes:
-        base: the space of each component.
-        cells: the unknowns of each element, where those of a node are adjacent.
-    """
+    """Functions with several components on the nodes of another space; results have a last axis of components."""
 
     def __init__(self, base: "GridSpace | MeshSpace", components: int) -> None:
         self.base, self.components = base, components
@@ -248,23 +228,15 @@ class VectorSpace(FunctionSpace):
 
 @jax.tree_util.register_static
 class MatrixSpace(FunctionSpace):
-    """The nodes of matrices from elsewhere, for which only the shape of nodal arrays is known.
+    """The nodes of matrices from elsewhere, for which only the shape of nodal arrays is known."""
 
-    Attributes:
-        dimension: the dimension of the manifold; None if it is not known.
-    """
-
-    dimension: int | None  # type: ignore[assignment]
+    dimension: int | None  # type: ignore[assignment]  # None if it is not known
 
     def __init__(self, shape: tuple[int, ...], dimension: int | None = None) -> None:
         self.node_shape, self.dimension, self.boundary = shape, dimension, ()
         self.domain = self.free = np.ones(shape, bool)
         self.n_components, self._labels = 1, np.zeros(shape, int)
         self._key = (shape, dimension)
-
-    def __repr__(self) -> str:
-        """Return one line: the unknowns and their shape."""
-        return f"MatrixSpace({self.n_dof} unknowns, nodes={self.node_shape}, dimension={self.dimension})"
 
 
 def grid_space(grid: Grid, boundary: tuple[Sides, ...]) -> GridSpace:
@@ -297,33 +269,22 @@ def couplings_for(values: Any, space: GridSpace) -> Bool[np.ndarray | Array, "of
 
     The result is None if the values are traced and all nodes of the domain are free.
     """
-    if not (is_traced(values) and is_staged()):
-        return free_couplings(space)
-    if (space.free == space.domain).all():
+    staged = is_traced(values) and is_staged()
+    if staged and (space.free == space.domain).all():
         return None
-    axes = _box(space.free)
+    axes = _box(space.free) if staged else None
     if axes is None:
-        return free_couplings(space)
-    rimmed = [
-        np.pad(axis, 1, mode="wrap" if wraps else "constant") for axis, wraps in zip(axes, space.periodic, strict=True)
-    ]
-    return _outer(
-        [np.stack([axis & end[s : s + axis.size] for s in range(3)]) for axis, end in zip(axes, rimmed, strict=True)]
-    )
+        return _free_couplings(space)
+    return _outer([_coupled(axis, (wraps,)) for axis, wraps in zip(axes, space.periodic, strict=True)])
 
 
 @lru_cache(maxsize=16)
-def free_couplings(space: GridSpace) -> Bool[np.ndarray, "offsets *shape"]:
-    """Mark the offsets and nodes of couplings with two free ends."""
-    free, d = space.free, space.dimension
-    for axis, wraps in enumerate(space.periodic):
-        widths = [(1, 1) if a == axis else (0, 0) for a in range(d)]
-        free = np.pad(free, widths, mode="wrap" if wraps else "constant")
-    starts = product((0, 1, 2), repeat=d)
-    shape = space.node_shape
-    return np.stack(
-        [space.free & free[tuple(slice(s, s + n) for s, n in zip(start, shape, strict=True))] for start in starts]
-    )
+def _free_couplings(space: GridSpace) -> Bool[np.ndarray, "offsets *shape"]:
+    return _coupled(space.free, space.periodic)
+
+
+def _coupled(free: Bool[np.ndarray, "*shape"], periodic: tuple[bool, ...]) -> Bool[np.ndarray, "offsets *shape"]:
+    return np.stack([free & other for other in neighbours(with_rim(free, periodic), free.ndim)])
 
 
 def _box(mask: Bool[np.ndarray, "*shape"]) -> list[Bool[np.ndarray, " _n"]] | None:

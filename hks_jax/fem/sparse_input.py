@@ -2,6 +2,8 @@
 
 import math
 import numbers
+from functools import partial
+from itertools import chain
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -61,9 +63,6 @@ def sparse_pencil(
         dimension: the dimension of the manifold, 2 or 3, for Weyl's law and for ``normalisation="flat"``.
         volume: the volume in the units of the metric, for ``normalisation="volume"``.
         shape: the shape of nodal arrays, with n nodes; None is (n,).
-
-    Returns:
-        The pencil. ``.stiffness`` is a `SparseOperator`, and ``.mass`` has the same pattern or is diagonal.
 
     Raises:
         ValueError: matrices that are not square, differ in size, are complex, NaN, infinite or unsymmetric (the message
@@ -169,10 +168,10 @@ def _pencil(K: Any, M: Any) -> SymmetricPencil:
     for name, matrix in (("K", K), ("M", M)):
         if isinstance(matrix, LinearOperator):
             raise TypeError(
-                f"{name}: got a LinearOperator; expected a matrix with entries, sparse or full, as it is factorised"
+                f"{name}: got a LinearOperator; expected a matrix with entries to factorise, sparse or dense"
             )
     if np.ndim(M) == 0 and isinstance(M, numbers.Number):
-        raise ValueError(f"M: got the number {M}; expected a matrix, its diagonal or None. If it is k, pass k={M}")
+        raise ValueError(f"M: got the number {M}; expected a matrix, its diagonal or None. If this is k, pass k={M}")
     stiffness = _entries("K", K)
     n, dtype = stiffness.size, stiffness.values.dtype
     diagonal, matrices = _diagonal(M, n, dtype), [stiffness]
@@ -194,8 +193,14 @@ def _pencil(K: Any, M: Any) -> SymmetricPencil:
                 f"M: {wrong.size} of its {diagonal.size} diagonal entries are not positive (the first is "
                 f"{float(diagonal[wrong[0]]):.6g}, in row {wrong[0]}); expected a positive definite mass"
             )
-    pattern = _pattern(n, *matrices)
-    one, *other = (_operator(pattern, matrix) for matrix in matrices)
+    # The pattern is the union of the patterns of all matrices, their transposes and the diagonal.
+    keys = [[a.astype(np.int64) * n + b for a, b in ((m.rows, m.cols), (m.cols, m.rows))] for m in matrices]
+    places = np.unique(np.concatenate([*chain(*keys), np.arange(n) * (n + 1)]))
+    pattern = SparsePattern(n, places // n, places % n)
+    one, *other = (
+        SparseOperator(_symmetric_part(m.values, *np.searchsorted(places, both), places.size), pattern)
+        for m, both in zip(matrices, keys, strict=True)
+    )
     return SymmetricPencil(one, other[0] if diagonal is None else DiagonalOperator(diagonal))
 
 
@@ -222,7 +227,7 @@ def _entries(name: str, matrix: Any) -> _Entries:
             rows, cols = np.nonzero(np.asarray(array))
         entries = _Entries(array[rows, cols], rows, cols, array.shape[0])
     if not is_traced(entries.values):
-        places, remedy = (entries.rows, entries.cols), f"If that is noise, pass ({name} + {name}.T) / 2"
+        places, remedy = (entries.rows, entries.cols), f"If this is noise, pass ({name} + {name}.T) / 2"
         require_symmetric(name, entries.values, places, entries.size, remedy)
     return entries
 
@@ -260,23 +265,7 @@ def _check_square(name: str, shape: tuple[int, ...]) -> None:
         raise ValueError(f"{name}: got shape {tuple(shape)}; expected a square matrix (n, n)")
 
 
-def _pattern(n: int, *matrices: _Entries) -> SparsePattern:
-    """Return the union of the patterns of all matrices, their transposes and the diagonal."""
-    keys = [rows.astype(np.int64) * n + cols for m in matrices for rows, cols in ((m.rows, m.cols), (m.cols, m.rows))]
-    places = np.unique(np.concatenate([*keys, np.arange(n) * (n + 1)]))
-    return SparsePattern(n, places // n, places % n)
-
-
-def _operator(pattern: SparsePattern, matrix: _Entries) -> SparseOperator:
-    """Return the symmetric part of a matrix: half of each entry at its place, and half at the transposed place."""
-    n = pattern.size
-    places = pattern.rows.astype(np.int64) * n + pattern.cols
-    rows, cols = matrix.rows.astype(np.int64), matrix.cols.astype(np.int64)
-    one, other = np.searchsorted(places, rows * n + cols), np.searchsorted(places, cols * n + rows)
-    entries = jnp.zeros(places.size, matrix.values.dtype)
-    half = matrix.values / 2
-    return SparseOperator(jax.jit(_add)(entries, one, other, half), pattern)
-
-
-def _add(entries: Array, one: Array, other: Array, half: Array) -> Array:
-    return entries.at[one].add(half).at[other].add(half)
+@partial(jax.jit, static_argnums=3)
+def _symmetric_part(values: Array, places: Array, transposed: Array, size: int) -> Float[Array, " size"]:
+    """Return ``size`` entries: half of each value at its place, and half at the transposed place."""
+    return jnp.zeros(size, values.dtype).at[places].add(values / 2).at[transposed].add(values / 2)

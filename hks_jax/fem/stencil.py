@@ -42,65 +42,56 @@ class GridPattern(ByKey, Pattern):
         return 3**self.space.dimension // 2 * self.space.free.size + np.flatnonzero(self.space.free)
 
     def bisect(self) -> Parts:
-        """Return the nested bisection of the grid."""
-        return _bisect(self.space)
+        """Bisect recursively by one or two lines of nodes (a plane in 3D), at the median of the longest side."""
+        x = np.stack(np.nonzero(self.space.free)).astype(np.int32)
+        d, n = x.shape
+        level, part, left, q = np.zeros(n, np.int8), np.zeros(n, int), np.arange(n), np.zeros(n, int)
+        depth = 0
+        while True:
+            parts = 1 << depth
+            counts = np.bincount(q, minlength=parts)
+            if counts.max() <= _CELL[d]:
+                level[left], part[left] = depth, q
+                return Parts(level, part, depth + 1)
+            # Cut every part across its longest side, at the median.
+            low, high = np.full((d, parts), np.iinfo(np.int32).max, np.int32), np.full((d, parts), -1, np.int32)
+            for axis in range(d):
+                np.minimum.at(low[axis], q, x[axis])
+                np.maximum.at(high[axis], q, x[axis])
+            longest = np.argmax(high - low, axis=0)
+            lowest, highest = (ends[longest, np.arange(parts)] for ends in (low, high))
+            across, along = longest.astype(np.int8)[q], x[0]
+            for axis in range(1, d):
+                along = np.where(across == axis, x[axis], along)
+            extent = int(np.max(highest - lowest)) + 1
+            first = np.arange(parts) * extent - lowest
+            sizes = np.bincount(first[q] + along, minlength=parts * extent).reshape(parts, extent)
+            cut = lowest + np.argmax(np.cumsum(sizes, axis=1) > counts[:, None] // 2, axis=1).astype(np.int32)
+            beyond = along - cut[q]
+            separates = beyond == 0
+            if d == 2:  # with an even number of lines, two cut lines leave equal halves, and so batches without padding
+                even = (highest - lowest) % 2 == 1
+                separates |= (beyond == -1) & even[q]
+            if depth == 0:  # also cut at node 0, so that the parts are not periodic
+                separates |= np.any(x[list(self.space.periodic)] == 0, axis=0)
+            cutting, stays = np.flatnonzero(separates), np.flatnonzero(~separates)
+            level[left[cutting]], part[left[cutting]] = depth, q[cutting]
+            q = 2 * q[stays] + (beyond[stays] > 0)
+            left, x = left[stays], np.take(x, stays, axis=1)
+            depth += 1
 
 
 @lru_cache(maxsize=16)
 def _couplings(space: GridSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    own = space.degrees_of_freedom.reshape(space.node_shape).astype(np.int32)
-    rimmed = own
-    for axis, wraps in enumerate(space.periodic):
-        widths = [(1, 1) if a == axis else (0, 0) for a in range(own.ndim)]
-        rimmed = np.pad(rimmed, widths, mode="wrap") if wraps else np.pad(rimmed, widths, constant_values=-1)
+    # Degrees of freedom are counted from 1, so that 0 is none.
+    own = (space.degrees_of_freedom + 1).reshape(space.node_shape).astype(np.int32)
     where, rows, cols = [], [], []
-    for o, start in enumerate(product((0, 1, 2), repeat=own.ndim)):
-        other = rimmed[tuple(slice(s, s + n) for s, n in zip(start, own.shape, strict=True))]
-        both = np.flatnonzero((own >= 0) & (other >= 0))
+    for o, other in enumerate(neighbours(with_rim(own, space.periodic), own.ndim)):
+        both = np.flatnonzero((own > 0) & (other > 0))
         where.append(o * own.size + both)
-        rows.append(own.ravel()[both])
-        cols.append(other.ravel()[both])
+        rows.append(own.ravel()[both] - 1)
+        cols.append(other.ravel()[both] - 1)
     return np.concatenate(where), np.concatenate(rows), np.concatenate(cols)
-
-
-def _bisect(space: GridSpace) -> Parts:
-    """Bisect the grid recursively by one or two lines of nodes (a plane in 3D), at the median of the longest side."""
-    x = np.stack(np.nonzero(space.free)).astype(np.int32)
-    d, n = x.shape
-    level, part, left, q = np.zeros(n, np.int8), np.zeros(n, int), np.arange(n), np.zeros(n, int)
-    depth = 0
-    while True:
-        parts = 1 << depth
-        counts = np.bincount(q, minlength=parts)
-        if counts.max() <= _CELL[d]:
-            level[left], part[left] = depth, q
-            return Parts(level, part, depth + 1)
-        # Cut every part across its longest side, at the median.
-        low, high = np.full((d, parts), np.iinfo(np.int32).max, np.int32), np.full((d, parts), -1, np.int32)
-        for axis in range(d):
-            np.minimum.at(low[axis], q, x[axis])
-            np.maximum.at(high[axis], q, x[axis])
-        longest = np.argmax(high - low, axis=0)
-        lowest, highest = (ends[longest, np.arange(parts)] for ends in (low, high))
-        across, along = longest.astype(np.int8)[q], x[0]
-        for axis in range(1, d):
-            along = np.where(across == axis, x[axis], along)
-        extent = int(np.max(highest - lowest)) + 1
-        first = np.arange(parts) * extent - lowest
-        sizes = np.bincount(first[q] + along, minlength=parts * extent).reshape(parts, extent)
-        cut = lowest + np.argmax(np.cumsum(sizes, axis=1) > counts[:, None] // 2, axis=1).astype(np.int32)
-        beyond = along - cut[q]
-        separates = beyond == 0
-        if d == 2:  # with an even number of lines, two cut lines leave equal halves, and so batches without padding
-            even = (highest - lowest) % 2 == 1
-            separates |= (beyond == -1) & even[q]
-        if depth == 0:  # also cut at node 0, so that the parts are not periodic
-            separates |= np.any(x[list(space.periodic)] == 0, axis=0)
-        cutting, stays = np.flatnonzero(separates), np.flatnonzero(~separates)
-        level[left[cutting]], part[left[cutting]] = depth, q[cutting]
-        q = 2 * q[stays] + (beyond[stays] > 0)
-        left, x = left[stays], np.take(x, stays, axis=1)
-        depth += 1
 
 
 class Stencil(eqx.Module):
@@ -109,16 +100,13 @@ class Stencil(eqx.Module):
     In this layout a product reads each coefficient once for all columns, which in 3D is about twice as fast as one row
     at a time. Stencils of one shape share compiled code, even if their masks differ.
 
-    Attributes:
-        coefficients: (3^d, *shape), with the offsets o in the order of ``product((-1, 0, 1), repeat=d)``: entry (o, i)
-            couples node i to node i + o. A diagonal is (1, *shape). Couplings across non-periodic sides are 0.
-        periodic: for each axis, whether node n is node 0; static.
-        slabs: the cut of the grid, if this is one device's slab inside `shard_map`; static.
+    The offsets o of the coefficients are in the order of ``product((-1, 0, 1), repeat=d)``: entry (o, i) couples node i
+    to node i + o. A diagonal is (1, *shape). Couplings across non-periodic sides are 0.
     """
 
     coefficients: Float[Array, "offsets *shape"]
-    periodic: tuple[bool, ...] = eqx.field(static=True)
-    slabs: Slabs | None = eqx.field(default=None, static=True)
+    periodic: tuple[bool, ...] = eqx.field(static=True)  # for each axis, whether node n is node 0
+    slabs: Slabs | None = eqx.field(default=None, static=True)  # if this is one device's slab inside `shard_map`
 
     @property
     def is_diagonal(self) -> bool:

@@ -1,7 +1,5 @@
 """Inner products and preconditioners for Gauss–Newton steps, in particular for conformal factors."""
 
-from abc import abstractmethod
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,21 +11,12 @@ from hks_jax.domain import spd
 from hks_jax.domain.grid import Grid
 from hks_jax.fem.assembly import assemble
 from hks_jax.fem.pencil import Pencil
-from hks_jax.fem.space import GridSpace
 from hks_jax.inverse.unknowns import Nodal, Values, flat_field
 from hks_jax.linear.dissection import dissect
 from hks_jax.linear.multifrontal import Factorisation, factorise
 
 
-class Preconditioner(eqx.Module):
-    """A symmetric positive definite approximation of JᵀJ + μB, up to a factor, that is easily inverted."""
-
-    @abstractmethod
-    def precondition(self, values: Values, damping: Float[Array, ""]) -> Values:
-        """Return the product of the approximation's inverse with the unknowns, for damping μ."""
-
-
-class InnerProduct(Preconditioner):
+class InnerProduct(eqx.Module):
     """A symmetric positive definite operator on unknowns, by default the identity."""
 
     def apply(self, values: Values) -> Values:
@@ -39,7 +28,7 @@ class InnerProduct(Preconditioner):
         return values
 
     def precondition(self, values: Values, damping: Float[Array, ""]) -> Values:
-        """Return the result of `solve`, without an approximation of JᵀJ."""
+        """Return the result of `solve`, for a system whose matrix JᵀJ is not known."""
         return self.solve(values)
 
 
@@ -70,7 +59,6 @@ def smoothing(grid: Grid, length: float, dtype: np.dtype) -> Smoothing:
     """Return the inner product of nodal values on a grid's domain."""
     pencil = assemble(flat_field(grid, dtype), mass="lumped")
     assert isinstance(pencil, Pencil)
-    assert isinstance(pencil.space, GridSpace)
     factor = None
     if length > 0:
         dissection = jax.tree.map(jnp.asarray, dissect(pencil.pattern))
@@ -92,7 +80,7 @@ _POWER, _REACH = 3, 9.0
 # which is x/6 for small x, the contribution tK/3 of the curvature, and of order 1/x for large x. So JᵀJ is about Σₜ wₜ
 # a(tL)², where L is the Laplacian. Except for the first few, its eigenvalues decrease as those of L increase. On a grid
 # they decrease faster, because interpolation between nodes damps oscillations of the factor.
-class ConformalInformation(Preconditioner):
+class ConformalInformation(eqx.Module):
     """B½ (1 + L/λ₁)⁻³ B½ with the lumped mass B and a Laplacian L of the initial metric by differences along edges.
 
     Its inverse is a polynomial, which takes three products. Where JᵀJ is less than μ, JᵀJ + μB does not decrease
@@ -106,7 +94,7 @@ class ConformalInformation(Preconditioner):
     largest: Float[Array, ""]  # a bound on the eigenvalues of L
 
     def precondition(self, values: Values, damping: Float[Array, ""]) -> Values:
-        """Return the product of the operator's inverse with the unknowns."""
+        """Return the product of the operator's inverse with the unknowns, for the damping μ."""
         fall = jnp.maximum(_TOP / damping, 1.01) ** (1 / _POWER)
         level = jnp.maximum(self.level, self.largest / (fall - 1))
         y = values / self.root

@@ -42,7 +42,8 @@ def fit_metric(
 
     The fit minimises half the weighted mean square of the differences between predicted and given signature, plus the
     penalties of the regularisers. Isometric metrics have the same signature, and high frequencies affect it little. So
-    the steps are damped, and smooth by default, and first change the directions that the data determine.
+    the steps are damped, and smooth by default, and first change the directions that the data determine. The result
+    states how the fit ended; a fit that stalls or is interrupted raises no error.
 
     Args:
         init: the initial metric: a field, or a grid for the flat metric. The fit keeps properties of the field that the
@@ -64,9 +65,6 @@ def fit_metric(
         search: the settings of the optimisation and its stopping criteria.
         progress: a function, such as ``print``, that is called with each step.
         checkpoint: a file that is written after each step. If the file exists, the fit resumes from it.
-
-    Returns:
-        The fit. ``fit.result`` states how it ended; a fit that stalls or is interrupted raises no error.
 
     Warns:
         AccuracyWarning: if the misfit is close to the truncation error of k pairs, so that the fit matches its own
@@ -118,8 +116,8 @@ def fit_metric(
     if truncation_shows(misfit, left):
         warn_of_accuracy(
             f"k: the truncation to {problem.k} eigenpairs causes a misfit of about {left:.1e}, and the fit's misfit "
-            f"is {misfit:.1e}. So the fit matches its own truncation. Use k=None, or k={more_pairs(problem, values)} "
-            f"or more, unless the target was computed with {problem.k} pairs"
+            f"is {misfit:.1e}. So the fitted metric may compensate for the truncation. Use k=None, or "
+            f"k={more_pairs(problem, values)} or more, unless the target was computed with {problem.k} pairs"
         )
     elif noise is not None and result in ("converged", "stalled") and misfit > noise**2:
         warn_of_accuracy(
@@ -127,15 +125,5 @@ def fit_metric(
             "The fitted metric does not explain the target, and its differences from init may be artefacts. Use "
             'another parametrisation, such as "log-euclidean", another init, weaker regularisers, or a larger noise='
         )
-    return MetricFit(
-        unknowns.field(values),
-        float(outcome.loss),
-        misfit,
-        left,
-        tuple(now.history),
-        result,
-        values,
-        problem,
-        tuple(now.losses),
-        noise,
-    )
+    field, history, losses = unknowns.field(values), tuple(now.history), tuple(now.losses)
+    return MetricFit(field, float(outcome.loss), misfit, left, history, result, values, problem, losses, noise)

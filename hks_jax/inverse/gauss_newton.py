@@ -12,7 +12,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.checks import require_count, require_number
-from hks_jax.inverse.conformal import InnerProduct, Preconditioner
+from hks_jax.inverse.conformal import ConformalInformation, InnerProduct
 from hks_jax.inverse.unknowns import Values
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
 
@@ -27,40 +27,21 @@ _FREE = 0.01
 """The largest share of damping in a step's curvature at which the step estimates the distance to the solution."""
 
 
-def remaining_change(last: Array, before: Array) -> Array:
-    """Return the last step or, if larger, the sum of the future steps in a geometric series with the last two."""
-    ratio = jnp.where(before > 0, last / before, jnp.inf)
-    return jnp.where(ratio < 1, last * jnp.maximum(1, ratio / (1 - ratio)), jnp.inf)
-
-
 class _State(eqx.Module):
-    """The state of the descent at the last accepted unknowns."""
+    """The state of the solver."""
 
-    values: Values  # the unknowns
-    gradient: Values  # the gradient
+    first: Bool[Array, ""]  # whether no unknowns have been accepted
+    trial: Values  # the unknowns to be evaluated next
+    finite: Bool[Array, ""]  # whether the last step is finite
+    step_size: Float[Array, ""]  # 1/μ, relative to the first
+    linearised: Any  # residuals and Jacobian at the last accepted unknowns
+    aux: Any  # the auxiliary output of the residuals there
+    gradient: Values  # the gradient there
     promised: Float[Array, ""]  # the linearised change of half the sum of squares by the last step
     change: Float[Array, ""]  # the size of the last accepted step, in tolerances
     damped: Float[Array, ""]  # xᵀBx of that step over its curvature; times μ, the share of damping
     tight: Bool[Array, ""]  # whether the linear systems are solved more exactly
     done: Bool[Array, ""]  # whether the descent has converged
-
-
-def begun(y: Values) -> _State:
-    """Return the state before any unknowns are accepted."""
-    far, no = jnp.asarray(jnp.inf, y.dtype), jnp.zeros((), bool)
-    return _State(y, jnp.zeros_like(y), jnp.zeros((), y.dtype), far, far, no, no)
-
-
-class _Progress(eqx.Module):
-    """The state of the solver."""
-
-    first: Bool[Array, ""]  # whether no step has been accepted
-    trial: Values  # the unknowns to be evaluated next
-    step_size: Float[Array, ""]  # 1/μ, relative to the first
-    linearised: Any  # residuals and Jacobian at the last accepted unknowns
-    aux: Any  # the auxiliary output of the residuals there
-    descent: _State  # the state of the descent there
-    finite: Bool[Array, ""]  # whether the last step is finite
 
 
 def _linearise(fn: Callable, values: Values, args: Any) -> tuple[Any, Any]:
@@ -74,7 +55,7 @@ def _empty(structure: Any) -> Any:
     return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else x, structure)
 
 
-class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
+class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _State]):
     """The default solver of `hks_jax.fit_metric`.
 
     Its steps δ solve (JᵀJ + μB) δ = −Jᵀr, where B is an inner product of the unknowns and μ = damping / step size. The
@@ -108,7 +89,7 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
     inner_product: InnerProduct
     inner_tolerance: Float[Array, ""]
     inner_steps: Int[Array, ""]
-    preconditioner: Preconditioner
+    preconditioner: InnerProduct | ConformalInformation
 
     def __init__(
         self,
@@ -118,7 +99,7 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         inner_product: InnerProduct | None = None,
         inner_tolerance: float | Array = 1e-2,
         inner_steps: int = 120,
-        preconditioner: Preconditioner | None = None,
+        preconditioner: InnerProduct | ConformalInformation | None = None,
     ) -> None:
         require_number("tolerance", tolerance)
         require_number("damping", damping, inclusive=True)
@@ -132,32 +113,32 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         self.preconditioner = preconditioner or self.inner_product
 
     def accepted(self, y: Values, state: _State) -> _State:
-        """Return the state after an accepted step to new unknowns; the next step computes the gradient there."""
-        step = y - state.values
-        change = optx.rms_norm(step / (self.rtol * (1 + jnp.abs(y))))
+        """Return the state after the step from y to the trial; the next step computes the gradient there."""
+        step = state.trial - y
+        change = optx.rms_norm(step / (self.rtol * (1 + jnp.abs(state.trial))))
         moved, curvature = change > 0, -jnp.vdot(step, state.gradient)
         damped = jnp.vdot(step, self.inner_product.apply(step)) / jnp.where(curvature > 0, curvature, 1)
         damped = jnp.where(moved & (curvature > 0), damped, jnp.inf)
-        settled = moved & (remaining_change(change, state.change) < 1)
+        # The distance to the solution is the step or, if larger, the rest of a geometric series with the last two.
+        ratio = change / state.change
+        settled = moved & (ratio < 1) & (change * jnp.maximum(1, ratio / (1 - ratio)) < 1)
         # The next step may be the last: it is below the tolerance if the steps keep shrinking at this rate.
         near = moved & jnp.isfinite(state.change) & (change**2 < state.change)
         change = jnp.where(moved, change, jnp.inf)
         tight, done = state.tight | near | settled, state.tight & settled
-        return _State(y, state.gradient, state.promised, change, damped, tight, done)
+        return dataclasses.replace(state, change=change, damped=damped, tight=tight, done=done)
 
-    def _done(self, step_size: Array, state: _State) -> Bool[Array, ""]:
+    def _done(self, state: _State) -> Bool[Array, ""]:
         """Return whether the unknowns have converged and are not merely held by damping."""
-        return state.done & (self.damping / step_size * state.damped < _FREE)
+        return state.done & (self.damping / state.step_size * state.damped < _FREE)
 
     # If g = Jᵀr and (JᵀJ + μB) x = g − ρ, conjugate gradients make the residual ρ orthogonal to x. So for δ = −x
     #
     #     ½|r + Jδ|² − ½|r|² = −gᵀx + ½ xᵀJᵀJx = −½ (gᵀx + μ xᵀBx).
-    def _next(
-        self, step_size: Array, linearised: Any, state: _State, needed: bool | Bool[Array, ""]
-    ) -> tuple[Values, _State]:
-        """Return the step δ, or zero after convergence, and the state with the gradient and the predicted reduction."""
-        jacobian, residual, shape = linearised.jac, linearised.residual, state.values.shape
-        adjoint, damping = jacobian.transpose(), self.damping / step_size
+    def _next(self, y: Values, state: _State, needed: bool | Bool[Array, ""]) -> _State:
+        """Return the state with the gradient at y, and with the next trial, which is y after convergence."""
+        jacobian, residual, shape = state.linearised.jac, state.linearised.residual, y.shape
+        adjoint, damping = jacobian.transpose(), self.damping / state.step_size
 
         # The program contains J and Jᵀ only once, because they dominate the compilation time.
         def normal(x: Array, first: Bool[Array, ""]) -> tuple[Array, float]:
@@ -170,27 +151,30 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
 
         tolerance = jnp.where(state.tight, self.inner_tolerance / _TIGHTER, self.inner_tolerance)
         most = jnp.where(state.tight, _LONGER * self.inner_steps, self.inner_steps)
-        most = jnp.where(needed & ~self._done(step_size, state), most, 0)
-        column = state.values.reshape(-1, 1)
-        solution = conjugate_gradients(normal, precondition, column, tolerance[None], most=most, orthogonal=True)
+        most = jnp.where(needed & ~self._done(state), most, 0)
+        solution = conjugate_gradients(
+            normal, precondition, y.reshape(-1, 1), tolerance[None], most=most, orthogonal=True
+        )
         x, gradient = solution.x.reshape(shape), solution.rhs.reshape(shape)
         promised = -(jnp.vdot(gradient, x) + damping * jnp.vdot(x, self.inner_product.apply(x))) / 2
         # A stationary point needs no step; a step of size zero would show no convergence.
         stationary = jnp.all(gradient == 0)
         done, damped = state.done | stationary, jnp.where(stationary, 0, state.damped)
-        return -x, dataclasses.replace(state, gradient=gradient, promised=promised, done=done, damped=damped)
+        found = {"trial": y - x, "finite": jnp.all(jnp.isfinite(x)), "gradient": gradient, "promised": promised}
+        return dataclasses.replace(state, **found, done=done, damped=damped)
 
     def init(
         self, fn: Callable, y: Values, args: Any, options: _Options, f_struct: Any, aux_struct: Any, tags: _Tags
-    ) -> _Progress:
+    ) -> _State:
         """Return the state before the first step, which evaluates ``y``."""
         structure, _ = eqx.filter_eval_shape(_linearise, fn, y, args)
-        yes, one = jnp.asarray(True), jnp.ones((), y.dtype)
-        return _Progress(yes, y, one, _empty(structure), _empty(aux_struct), begun(y), yes)
+        known = _empty(structure), _empty(aux_struct), jnp.zeros_like(y)
+        yes, (zero, one, far) = jnp.asarray(True), jnp.asarray([0, 1, jnp.inf], y.dtype)
+        return _State(yes, y, yes, one, *known, zero, far, far, ~yes, ~yes)
 
     def step(
-        self, fn: Callable, y: Values, args: Any, options: _Options, state: _Progress, tags: _Tags
-    ) -> tuple[Values, _Progress, Any]:
+        self, fn: Callable, y: Values, args: Any, options: _Options, state: _State, tags: _Tags
+    ) -> tuple[Values, _State, Any]:
         """Accept or reject the trial, and choose the next; return the unknowns and the auxiliary output.
 
         Choosing the next trial is most of the work. It is skipped if the option ``"enough"``, a function of that
@@ -201,38 +185,29 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _Progress]):
         linearised = eqx.combine(
             eqx.filter(linearised, eqx.is_array), eqx.filter(state.linearised, eqx.is_array, inverse=True)
         )
-        promised = state.descent.promised
         change = linearised.as_min() - state.linearised.as_min()
-        accept = state.first | (change <= _ACCEPTED * promised)
-        good = ~state.first & (change < _GOOD * promised) & (promised < 0)
+        accept = state.first | (change <= _ACCEPTED * state.promised)
+        good = ~state.first & (change < _GOOD * state.promised) & (state.promised < 0)
         step_size = state.step_size * jnp.where(good, self.growth, jnp.where(accept, 1, _SHRINKING))
 
-        before, static = eqx.partition((y, state.linearised, state.aux, state.descent), eqx.is_array)
-        taken = state.trial, linearised, aux, self.accepted(state.trial, state.descent)
-        now = jax.lax.cond(accept, lambda: eqx.filter(taken, eqx.is_array), lambda: before)
-        values, linearised, aux, descent = eqx.combine(now, static)
-        needed = ~options["enough"](aux) if "enough" in options else True
-        step, descent = self._next(step_size, linearised, descent, needed)
-        no, finite = jnp.asarray(False), jnp.all(jnp.isfinite(step))
-        return values, _Progress(no, values + step, step_size, linearised, aux, descent, finite), aux
+        accepted = dataclasses.replace(self.accepted(y, state), linearised=linearised, aux=aux)
+        before, static = eqx.partition((y, state), eqx.is_array)
+        after = eqx.filter((state.trial, accepted), eqx.is_array)
+        y, state = eqx.combine(jax.lax.cond(accept, lambda: after, lambda: before), static)
+        state = dataclasses.replace(state, first=jnp.asarray(False), step_size=step_size)
+        needed = ~options["enough"](state.aux) if "enough" in options else True
+        state = self._next(y, state, needed)
+        return y, state, state.aux
 
     def terminate(
-        self, fn: Callable, y: Values, args: Any, options: _Options, state: _Progress, tags: _Tags
+        self, fn: Callable, y: Values, args: Any, options: _Options, state: _State, tags: _Tags
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """Return whether the unknowns have converged, and whether the last step is finite."""
         successful, not_finite = optx.RESULTS.successful, optx.RESULTS.nonlinear_divergence
-        return self._done(state.step_size, state.descent), optx.RESULTS.where(state.finite, successful, not_finite)
+        return self._done(state), optx.RESULTS.where(state.finite, successful, not_finite)
 
     def postprocess(
-        self,
-        fn: Callable,
-        y: Values,
-        aux: Any,
-        args: Any,
-        options: _Options,
-        state: _Progress,
-        tags: _Tags,
-        result: Any,
+        self, fn: Callable, y: Values, aux: Any, *args: Any, **settings: Any
     ) -> tuple[Values, Any, dict[str, Any]]:
         """Return the unknowns and the auxiliary output unchanged."""
         return y, aux, {}

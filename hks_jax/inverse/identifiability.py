@@ -85,9 +85,6 @@ def identifiability(
         iterations: the number of subspace iterations, each with n + 8 products with J and with Jᵀ.
         seed: the seed of the random initial subspace.
 
-    Returns:
-        The spectrum, directions, resolution and uncertainty.
-
     Raises:
         ValueError: if a problem is given without values, or if n is out of range.
 
@@ -101,7 +98,7 @@ def identifiability(
     problem = fit.problem if isinstance(fit, MetricFit) else fit
     values = fit.values if isinstance(fit, MetricFit) and values is None else values
     if values is None:
-        raise ValueError("values: got None for a problem; expected the values at which to linearise")
+        raise ValueError("values: got None for a problem; expected the values of the unknowns at which to linearise")
     total = values.size
     if not 1 <= n <= total or not 1 <= n_weak <= total:
         raise ValueError(f"n, n_weak: got {n}, {n_weak}; expected 1 to {total}, the number of unknowns")
@@ -120,17 +117,9 @@ def identifiability(
     share = strengths / (strengths + variance / prior**2)
     squares = directions.reshape(n, len(values), -1) ** 2
     resolution = jnp.einsum("n,nxc->x", share, squares) / squares.shape[2]
-    return Identifiability(
-        strengths,
-        directions,
-        weak[:n_weak],
-        weak_directions[:n_weak],
-        resolution,
-        prior * jnp.sqrt(jnp.maximum(1 - resolution, 0)),
-        jnp.sum(share),
-        noise,
-        prior,
-    )
+    deviation = prior * jnp.sqrt(jnp.maximum(1 - resolution, 0))
+    found = strengths, directions, weak[:n_weak], weak_directions[:n_weak], resolution, deviation
+    return Identifiability(*found, jnp.sum(share), noise, prior)
 
 
 def _information(problem: Problem, values: Values) -> Any:

@@ -94,10 +94,8 @@ class Observation(eqx.Module):
 
     def pairs_needed(self, k: int | None, pencil: AnyPencil, field: TensorField) -> int:
         """Return the number of eigenpairs to compute: k, or enough for the observed times."""
-        if self.signature.lowest:
-            return self.shape[0]
         times = None if self.times is None else self.observed_times
-        return self.signature.pairs_needed(k, times, pencil, field)
+        return self.shape[0] if self.signature.lowest else self.signature.pairs_needed(k, times, pencil, field)
 
     def residuals(self, pairs: Eigenpairs) -> Float[Array, " m"]:
         """Return the residuals. The misfit is half their sum of squares."""
@@ -194,7 +192,7 @@ def _weights(values: np.ndarray, data: Data) -> tuple[np.ndarray, float | None]:
         return given, data.noise
     size = _broadcast("deviation", data.deviation, values.shape)
     used = (given > 0) & np.isfinite(values)
-    remedy = "Expected a positive number for every observed value; set the weight of others to 0"
+    remedy = "Expected a positive number for every observed value; set the weight of other values to 0"
     _refuse("deviation", size, used & ~(np.isfinite(size) & (size > 0)), used, "not positive numbers", remedy)
     of_residuals = np.where(used, size if data.loss == "absolute" else size / np.abs(values), 1.0)
     weighed = np.where(used, given / of_residuals**2, 0.0)

@@ -20,27 +20,18 @@ _REJECTIONS = 12
 """The number of consecutive rejected steps after which a fit counts as stalled."""
 
 
-class _Told(eqx.Module):
-    """The auxiliary output of residuals and objective, and the unknowns to which it belongs."""
-
-    values: Values  # the unknowns
-    outcome: Outcome  # loss and misfit there
-    gradient: Float[Array, ""]  # the norm of the objective's gradient; NaN where it was not computed
-
-
-def _residuals(values: Values, problem: Problem) -> tuple[Array, _Told]:
-    """Return residuals and their auxiliary output.
+def _residuals(values: Values, problem: Problem) -> tuple[Array, Outcome]:
+    """Return residuals and, as auxiliary output, the outcome.
 
     The number of nodes scales the residuals, so that a step's curvature is of order one on every grid.
     """
     data, penalties, outcome = problem.evaluate(values)
-    everything = jnp.sqrt(len(values)) * jnp.concatenate([data, penalties])
-    return everything, _Told(values, outcome, jnp.full((), jnp.nan, data.dtype))
+    return jnp.sqrt(len(values)) * jnp.concatenate([data, penalties]), outcome
 
 
-def _half_squares(values: Values, problem: Problem) -> tuple[Float[Array, ""], _Told]:
-    residuals, told = _residuals(values, problem)
-    return jnp.sum(residuals**2) / 2, told
+def _half_squares(values: Values, problem: Problem) -> tuple[Float[Array, ""], Outcome]:
+    residuals, outcome = _residuals(values, problem)
+    return jnp.sum(residuals**2) / 2, outcome
 
 
 _objective = eqx.filter_custom_jvp(_half_squares)
@@ -50,10 +41,10 @@ _objective = eqx.filter_custom_jvp(_half_squares)
 def _objective_jvp(primals: tuple, tangents: tuple) -> tuple:
     """Compute the gradient with the value in order to report it; every solver that differentiates needs it."""
     (values, problem), (direction, _) = primals, tangents
-    (value, told), gradient = jax.value_and_grad(_half_squares, has_aux=True)(values, problem)
-    told = _Told(told.values, told.outcome, jnp.linalg.norm(jnp.ravel(gradient)))
-    constant = jax.tree.map(lambda x: jnp.zeros_like(x) if eqx.is_inexact_array(x) else None, told)
-    return (value, told), (jnp.sum(gradient * direction), constant)
+    (value, outcome), gradient = jax.value_and_grad(_half_squares, has_aux=True)(values, problem)
+    outcome = outcome._replace(gradient=jnp.linalg.norm(jnp.ravel(gradient)))
+    constant = jax.tree.map(lambda x: jnp.zeros_like(x) if eqx.is_inexact_array(x) else None, outcome)
+    return (value, outcome), (jnp.sum(gradient * direction), constant)
 
 
 # A solver's state contains the trace of the residuals, and `_advance` is compiled again for another trace. The cache of
@@ -71,17 +62,17 @@ def _advance(
 ) -> tuple:
     """Take a step. Gauss–Newton does not choose the next step if the misfit is small enough."""
 
-    def enough(told: _Told) -> Bool[Array, ""]:
-        return told.outcome.misfit <= sufficient
+    def enough(outcome: Outcome) -> Bool[Array, ""]:
+        return outcome.misfit <= sufficient
 
     options = {"enough": enough} if isinstance(optimiser, GaussNewton) else {}
-    values, state, told = optimiser.step(fn, values, problem, options, state, frozenset())
+    values, state, outcome = optimiser.step(fn, values, problem, options, state, frozenset())
     done, result = optimiser.terminate(fn, values, problem, {}, state, frozenset())
     step_size = jnp.ones(())
     if isinstance(optimiser, GaussNewton):
-        told = _Told(told.values, told.outcome, jnp.linalg.norm(jnp.ravel(state.descent.gradient)))
+        outcome = outcome._replace(gradient=jnp.linalg.norm(jnp.ravel(state.gradient)))
         step_size = state.step_size
-    return values, _strongly_typed(state), told, done, result == optx.RESULTS.successful, step_size
+    return values, _strongly_typed(state), outcome, done, result == optx.RESULTS.successful, step_size
 
 
 def _strongly_typed(state: Any) -> Any:
@@ -112,21 +103,21 @@ def optimise(
     explained = float(values.dtype.type(-1.0 if noise is None else noise**2 / 2))  # rounded as in `_advance`
     try:
         state = _begin(optimiser, fn, values, problem)
-        # Take one step more than `max_steps`, because many solvers report their unknowns one step later.
+        # Take one step more than `max_steps`, because many solvers return the result of a step only in the next one.
         for count in range(max_steps + 2):
             before = values
             sufficient = jnp.asarray(jnp.inf if count >= max_steps else explained, values.dtype)
-            values, state, told, done, fine, size = _advance(optimiser, fn, values, problem, state, sufficient)
+            values, state, outcome, done, fine, size = _advance(optimiser, fn, values, problem, state, sufficient)
             accepted = count == 0 or bool(jnp.any(values != before))
             rejected = 0 if accepted else rejected + 1
-            new = seen is None or bool(jnp.any(told.values != seen))
+            new = seen is None or bool(jnp.any(outcome.values != seen))
             if new or isinstance(optimiser, GaussNewton):
-                seen, loss, misfit = told.values, float(told.outcome.loss), float(told.outcome.misfit)
-                gradient = float(told.gradient) / np.sqrt(len(values))
+                seen, loss, misfit = outcome.values, float(outcome.loss), float(outcome.misfit)
+                gradient = float(outcome.gradient) / np.sqrt(len(values))
                 if not np.isfinite(loss):
                     return best._replace(result="not finite")
                 if loss <= least:
-                    best, least = Reached(seen, told.outcome, ""), loss
+                    best, least = Reached(seen, outcome, ""), loss
                 log(number, (loss, misfit, gradient), new, seen, float(size))
                 number += 1
                 if misfit <= explained:

@@ -29,12 +29,14 @@ precision has errors of 1e-6 in J and 1e-5 to 3e-5 in Jᵀ; this tolerance has 5
 
 
 class Outcome(NamedTuple):
-    """Loss, misfit and eigenpairs at some unknowns."""
+    """The result of an evaluation at some unknowns."""
 
     loss: Float[Array, ""]  # half the weighted mean square of the residuals, plus the penalties
     misfit: Float[Array, ""]  # the data's part of the loss
     truncation: Float[Array, ""]  # see `Observation.truncation_misfit`
     pairs: Eigenpairs  # the eigenpairs, without their arrays at nodes and without their pencil
+    values: Values  # the unknowns
+    gradient: Float[Array, ""]  # the norm of the gradient in the scale of the solver; NaN where it was not computed
 
 
 class Problem(eqx.Module):
@@ -65,7 +67,8 @@ class Problem(eqx.Module):
         misfit = jnp.sum(data**2) / 2
         truncation = self.observation.truncation_misfit(pairs)
         pairs = eqx.tree_at(lambda p: (p.vectors, p.frame, p.pencil), pairs, (None, None, None))
-        outcome = Outcome(misfit + jnp.sum(penalty**2) / 2, misfit, truncation, pairs)
+        nan = jnp.full((), jnp.nan, data.dtype)
+        outcome = Outcome(misfit + jnp.sum(penalty**2) / 2, misfit, truncation, pairs, values, nan)
         return data, penalty, jax.lax.stop_gradient(outcome)
 
     def residuals(self, values: Values) -> tuple[Float[Array, " m"], Float[Array, " r"]]:

@@ -13,7 +13,7 @@ import optimistix as optx
 
 from hks_jax.checks import require_count, require_number
 from hks_jax.inverse.checkpoint import Checkpoint, save
-from hks_jax.inverse.conformal import InnerProduct, Preconditioner, conformal_information, smoothing
+from hks_jax.inverse.conformal import ConformalInformation, InnerProduct, conformal_information, smoothing
 from hks_jax.inverse.gauss_newton import GaussNewton
 from hks_jax.inverse.metric_fit import Step
 from hks_jax.inverse.optimise import Optimiser, Reached, optimise
@@ -118,27 +118,20 @@ class Run:
             save(self.path, self.mark, now)
 
     def solve(self, problem: Problem, values: Values, tolerances: float = 1.0, step_size: float = 1.0) -> Reached:
-        """Solve one problem from given unknowns; the tolerances are multiplied by a factor."""
-        method = self._optimiser(problem, tolerances * self.search.tolerance, step_size)
+        """Solve one problem from given unknowns; a factor multiplies tolerances, the step size divides the damping."""
+        method, tolerance = self.search.optimiser, tolerances * self.search.tolerance
+        if method == "gauss-newton":
+            # Noise requires small steps, because the misfit must not fall far below it.
+            damping, growth = (1e-4, 10.0) if self.noise is None else (1e-2, 3.0)
+            known, preconditioner = self.inner_product, self._preconditioner(problem)
+            method = GaussNewton(tolerance, damping / step_size, growth, known, preconditioner=preconditioner)
+        elif isinstance(method, str):
+            traced = jnp.asarray(tolerance)  # a static value would cause a compilation for every stage
+            method = OPTIMISERS[method](traced, traced, optx.rms_norm)
         with jax.debug_nans(False):  # values that were not computed are NaN
             return optimise(problem, values, method, self.noise, self.search.max_steps, self.told)
 
-    def _optimiser(self, problem: Problem, tolerance: float, step_size: float) -> Optimiser:
-        """Return the solver. The initial damping is divided by the step size."""
-        given = self.search.optimiser
-        if not isinstance(given, str):
-            return given
-        if given == "gauss-newton":
-            # Noise requires small steps, because the misfit must not fall far below it.
-            damping, growth = (1e-4, 10.0) if self.noise is None else (1e-2, 3.0)
-            preconditioner = self._preconditioner(problem)
-            return GaussNewton(
-                tolerance, damping / step_size, growth, self.inner_product, preconditioner=preconditioner
-            )
-        traced = jnp.asarray(tolerance)  # a static value would cause a compilation for every stage
-        return OPTIMISERS[given](traced, traced, optx.rms_norm)
-
-    def _preconditioner(self, problem: Problem) -> Preconditioner:
+    def _preconditioner(self, problem: Problem) -> InnerProduct | ConformalInformation:
         """Return an approximation of JᵀJ if one is known, otherwise the inner product."""
         unknowns, observation = problem.unknowns, problem.observation
         if isinstance(unknowns, Nodal) and unknowns.parametrisation == PARAMETRISATIONS["conformal"]:

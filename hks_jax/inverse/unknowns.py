@@ -43,7 +43,7 @@ class Parametrisation(eqx.Module):
     Attributes:
         start: maps the initial tensors (n, d, d) to their parameters (n, c).
         tensors: maps parameters (n, c) and the initial tensors to tensors that are always symmetric positive definite.
-        smooth: whether the data determine high frequencies so weakly that steps should be smooth.
+        smooth: whether to smooth the solver's steps, because the data hardly determine high frequencies.
     """
 
     start: Callable[[Tensors], Parameters] = eqx.field(static=True)
@@ -141,7 +141,10 @@ class Unknowns(eqx.Module):
 
     def slopes(self, values: Values) -> list[Float[Array, "c *edges"]]:
         """Return the slopes of the values along the grid's edges for each axis; 0 if an end is outside the domain."""
-        raise ValueError("regularisers: got a slope penalty on function parameters; expected Prior or LogDeterminant")
+        raise ValueError(
+            "regularisers: got a slope penalty, but the unknowns are parameters of a function and have no slopes on "
+            "the grid; expected Prior or LogDeterminant"
+        )
 
 
 class Nodal(Unknowns):

@@ -96,9 +96,9 @@ def read_tensors(
     else:
         (name,), reader = paths, format_of(paths[0])
         if array is not None and "array" not in reader.options:
-            raise ValueError(f"array: got {array!r}, but only npz and VTK files have arrays by name. Leave it out")
+            raise ValueError(f"array: got {array!r}, but only npz and VTK files have named arrays. Leave it out")
         if spacing is not None and "spacing" not in reader.options:
-            raise ValueError(f"spacing: {name} has its own, and only NumPy's files may need one. Leave it out")
+            raise ValueError(f"spacing: {name} declares its own; only NumPy's files may lack one. Leave it out")
         given = {"array": array, "spacing": spacing, "confidence": confidence}
         volume = reader.read_tensors(name, order, frame, **{option: given[option] for option in reader.options})
         if not name.lower().endswith(".nhdr"):  # a detached header does not identify the data file
@@ -189,7 +189,8 @@ def save_tensors(
     neither `order` nor `frame`. Units are written except to VTK's files.
 
     Raises:
-        ValueError: the suffix is unknown; the format is NIfTI for a slice, or NIfTI or NRRD for unsymmetric tensors.
+        ValueError: the suffix is unknown, or the format cannot hold the field: NIfTI holds no slices, and neither NIfTI
+            nor NRRD holds unsymmetric tensors.
         ImportError: an optional library is missing; the message gives the command that installs it.
 
     Examples:

@@ -87,7 +87,7 @@ def _compare(content: bytes, suffix: str, declared: tuple[int, ...], mesh: Any) 
     lists = re.search(rb"\bCELLS\s+(\d+)\s+(\d+)", content) if suffix == ".vtk" else None
     if lists is not None:  # before version 5, the declared number also counts one entry per cell
         listed = int(lists[2]) - (0 if re.match(rb"# vtk DataFile Version [5-9]", content) else counts[1])
-        if listed != corners:  # meshio omits corners of cells whose type is damaged
+        if listed != corners:  # if a cell's type is wrong, meshio omits corners
             raise ValueError(f"the file declares {listed} corners of cells; expected {corners} from the cells' types")
     if suffix == ".ply":
         _compare_ply(content, mesh)
@@ -178,7 +178,7 @@ def fans(
         ValueError: a vertex does not exist, or a polygon has no such corner; `numbers` are its numbers in the file.
     """
     if polygons.ndim != 2 or polygons.shape[1] < 3:
-        raise ValueError(f"{file}: got faces of shape {polygons.shape}; expected (n, 3) or more corners")
+        raise ValueError(f"{file}: got faces of shape {polygons.shape}; expected at least 3 corners each")
     (n, size), low, high = polygons.shape, polygons.min(initial=0), polygons.max(initial=0)
     if low < 0 or high >= len(points):
         raise ValueError(f"{file}: a face refers to vertex {low if low < 0 else high}; expected 0 … {len(points) - 1}")
@@ -252,7 +252,7 @@ def load_off(file: Path) -> Loaded:
         for row, corners in zip(rows[n_vertices:], polygons, strict=True):
             # A colour may follow the corners, as an index or as three or four numbers.
             if len(corners) != int(row[0]) or len(corners) < 3 or len(row) - 1 - len(corners) > 4:
-                raise ValueError(f"got the face {' '.join(row)[:60]}; expected a count of corners, corners, a colour")
+                raise ValueError(f"got the face {' '.join(row)[:60]}; expected n, n corners, optional colour")
     return _triangulated(file, vertices, polygons)
 
 

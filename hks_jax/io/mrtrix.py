@@ -26,7 +26,7 @@ def load(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, Float
         header, offset = _header(content)
         shape = tuple(int(n) for n in header["dim"][0].split(","))
         if min(shape) < 1 or len(shape) < 3:
-            raise ValueError(f"dim: got {header['dim'][0]}; expected three positive sizes or more")
+            raise ValueError(f"dim: got {header['dim'][0]}; expected at least three positive sizes")
         count, dtype = math.prod(shape), header["datatype"][0].strip()
         length = -(-count // 8) if dtype == "Bit" else count * _dtype(dtype).itemsize
         if len(content) != offset + length:

@@ -23,7 +23,7 @@ CLEAR = 3.5
 _SMOOTH = 3.0
 """The mean angle, in degrees, below which differences between frames come from the discrete steps between voxels."""
 
-_SAID = "Principal directions differ from those of the two neighbours along them by"
+_SAID = "Principal directions differ from the mean direction of their two neighbours along the fibre by"
 
 
 class Alternative(NamedTuple):

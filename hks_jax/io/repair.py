@@ -191,8 +191,9 @@ def without_background(volume: TensorVolume) -> TensorVolume:
 def find_background(volume: TensorVolume) -> tuple[Bool[np.ndarray, "*shape"], str] | None:
     """Return the voxels that a program seems to have filled as background, and a sentence; None if there are few.
 
-    Measured tensors are never exactly equal and isotropic, nor a millionth of the others. Programs such as ANTs write
-    such tensors where there is no signal. The result is None for a volume with a mask, and for a constant field.
+    Measured tensors are never exactly isotropic and equal to one another, and never a million times smaller than the
+    others. Programs such as ANTs write such tensors where there is no signal. The result is None for a volume with a
+    mask, and for a constant field.
 
     Examples:
         >>> tensors = np.array(field.tensors)
@@ -248,7 +249,7 @@ def positive_tensors(volume: TensorVolume, how: PositiveMap, number: float) -> T
     mapped = np.asarray(positive_map("tensors", given, how, number, inside, "voxel"))
     tensors = np.where(inside[..., None, None], mapped, volume.tensors)
     formula = f"exp(S/{number:g})" if how == "exp" else f"S + {number:g}·I"
-    note = f"{formula} of all tensors S, of which {before} of {int(inside.sum())} were not positive definite"
+    note = f"{formula} of all tensors S; {before} of {int(inside.sum())} tensors were not positive definite"
     report = {"method": how, NUMBERS[how]: float(number), "voxels": before, "of": int(inside.sum())}
     return replace(volume, tensors=tensors, covariance=None, modes=None, repair=report, notes=(*volume.notes, note))
 

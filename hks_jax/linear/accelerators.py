@@ -53,27 +53,20 @@ def kernels_agree(name: str, dtype: Any, compare: Callable[[], Iterable[tuple[An
         return False
     key = name, np.dtype(dtype).name
     if key not in _PROVED:
-        failure = ""
         try:
             with ThreadPoolExecutor(1) as pool:  # a separate thread computes, even while this one traces
                 results = pool.submit(lambda: [tuple(map(np.asarray, pair)) for pair in compare()]).result()
-            for found, expected in results:
-                error = np.max(np.abs(found - expected))
-                if not error <= float(np.finfo(dtype).eps) ** 0.6 * np.max(np.abs(expected)):
-                    failure = f"have an error of {error:.1e}"
+            error = np.max([np.max(np.abs(found - right)) / np.max(np.abs(right)) for found, right in results])
+            failure = "" if error <= float(np.finfo(dtype).eps) ** 0.6 else f"have a relative error of {error:.1e}"
         except DeprecationWarning:  # JAX deprecates Triton; if warnings are errors, use no kernels
             _PROVED[key] = False
             return False
-        except Exception as error:  # the kernel compiler may raise any error
-            failure = f"do not compile ({str(error).strip().splitlines()[0]})" if str(error) else "do not compile"
+        except Exception as reason:  # the kernel compiler may raise any error
+            failure = f"do not compile ({(str(reason).strip() or type(reason).__name__).splitlines()[0]})"
         if failure:
-            device = jax.local_devices()[0]
-            warnings.warn(
-                f"on {device.device_kind} the kernels of {name} in {key[1]} {failure}; slower XLA operations replace "
-                "them",
-                RuntimeWarning,
-                stacklevel=2,
-            )
+            device = jax.local_devices()[0].device_kind
+            message = f"on {device} the kernels of {name} in {key[1]} {failure}; slower XLA operations replace them"
+            warnings.warn(message, RuntimeWarning, stacklevel=2)
         _PROVED[key] = not failure
     return _PROVED[key]
 
@@ -86,6 +79,6 @@ def padded_size(n: int, least: int) -> int:
 def row_by_row(x: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return the array; on accelerators, force row-major memory layout.
 
-    Otherwise, XLA transposes a whole large array there if a part is needed transposed.
+    Otherwise, if only the transpose of a part is needed, XLA transposes the whole array on accelerators.
     """
     return with_layout_constraint(x, Layout(major_to_minor=tuple(range(x.ndim)))) if at_hand() else x

@@ -44,16 +44,12 @@ class Solution(NamedTuple):
         return xp.where(self.errors <= 1, self.x, xp.nan)
 
 
-def _dot(x: Float[Array, "n b"], y: Float[Array, "n b"]) -> Float[Array, " b"]:
-    return (x * y).sum(axis=0)
-
-
 def conjugate_gradients(
     product: Callable[..., tuple[Array, Array]],  # x ↦ Aᵢxᵢ, and the energies below which Aᵢ counts as singular
     precondition: Callable[[Array], Array],  # r ↦ an approximation of Aᵢ⁻¹rᵢ
     rhs: Float[Array, "n b"],
     wanted: Float[Array, " b"],  # the wanted relative error in the energy norm; if infinite, the column stays zero
-    inner: Callable[[Array, Array], Array] = _dot,
+    inner: Callable[[Array, Array], Array] = lambda x, y: (x * y).sum(axis=0),
     clean: Callable[[Array], Array] | None = None,
     most: Int[Array, ""] | int = _MOST_STEPS,  # the maximal number of steps
     orthogonal: bool = False,

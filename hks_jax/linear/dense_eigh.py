@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from hks_jax.checks import real_array, require_number
 from hks_jax.linear import lapack
+from hks_jax.linear.operators import require_symmetric
 from hks_jax.linear.products import matmul
 from hks_jax.traced import is_traced
 
@@ -203,23 +204,11 @@ def _symmetric(name: str, matrix: Any) -> Matrix:
     if array.dtype not in (jnp.float32, jnp.float64):
         raise ValueError(f"{name}: got dtype {array.dtype}; expected float32 or float64")
     if not is_traced(array):
-        _require_symmetric(name, np.asarray(array))
+        known, limit = np.asarray(array), float(jnp.finfo(array.dtype).eps) ** 0.5
+        with np.errstate(invalid="ignore"):
+            symmetric = np.abs(known - known.T).max() <= limit * np.abs(known).max()
+        if not symmetric:
+            rows, cols = np.indices(known.shape).reshape(2, -1)
+            remedy = f"Pass ({name} + {name}.T) / 2 if this is noise"
+            require_symmetric(name, known.ravel(), (rows, cols), len(known), remedy, limit)
     return (array + array.T) / 2
-
-
-def _require_symmetric(name: str, array: np.ndarray) -> None:
-    """Raise ValueError unless the matrix is finite, and symmetric up to noise."""
-    finite = np.isfinite(array)
-    if not finite.all():
-        i, j = np.argwhere(~finite)[0]
-        raise ValueError(f"{name}: got {array[i, j]} in row {i}, column {j}; expected finite numbers")
-    skew = np.abs(array - array.T)
-    i, j = sorted(np.unravel_index(np.argmax(skew), skew.shape))
-    largest = np.abs(array).max()
-    limit = np.sqrt(np.finfo(array.dtype).eps)
-    if skew[i, j] > limit * largest:
-        raise ValueError(
-            f"{name}: got {array[i, j]:.6g} in row {i}, column {j}, and {array[j, i] - array[i, j]:.2g} more in row "
-            f"{j}, column {i}; expected a matrix that is symmetric up to {limit:.2g} of its largest entry, "
-            f"{largest:.6g}. Pass ({name} + {name}.T) / 2 if the difference is noise"
-        )

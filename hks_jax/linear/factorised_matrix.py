@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -35,8 +35,8 @@ _SEARCHED, _TURNS = 16, 4
 """The number of null vectors that an error message searches for, and the number of iterations."""
 
 
-Fields = tuple[tuple[Array, ...], tuple[Array, ...], Array]
-"""The arrays of a factorisation without its dissection, because XLA would copy arguments that are returned."""
+Scalar = Float[Array, ""]
+Columns = Float[Array, "n m"]
 
 
 class Inertia(NamedTuple):
@@ -62,7 +62,7 @@ class FactorisedMatrix(eqx.Module):
     matrix: PatternedOperator
     factor: Factorisation
     sound: Bool[Array, ""]
-    error: Float[Array, ""]
+    error: Scalar
 
     def __repr__(self) -> str:
         return f"FactorisedMatrix(size={self.size}, dtype={self.matrix.dtype})"
@@ -80,7 +80,7 @@ class FactorisedMatrix(eqx.Module):
         return Inertia(*(jnp.where(self.sound, count, -1) for count in counts))
 
     @property
-    def sign(self) -> Float[Array, ""]:
+    def sign(self) -> Scalar:
         """The sign of the determinant, ±1; NaN if it is uncertain."""
         return _nan_unless(self.sound, (1 - 2 * (self.factor.negative % 2)).astype(self.matrix.dtype))
 
@@ -96,7 +96,7 @@ class FactorisedMatrix(eqx.Module):
         x = _solve(self.matrix, jax.lax.stop_gradient(self.factor), b.reshape(self.size, -1)).reshape(b.shape)
         return _nan_unless(self.sound, x)
 
-    def logdet(self) -> Float[Array, ""]:
+    def logdet(self) -> Scalar:
         """Return log|det A|; `sign` has the sign.
 
         Raises:
@@ -128,7 +128,7 @@ class FactorisedMatrix(eqx.Module):
             if self.error > _DOUBTFUL:
                 warn_of_accuracy(
                     f"matrix: rounding in {self.matrix.dtype} causes an error of about {float(self.error):.1g} in "
-                    "log|det A|, and as large a relative error in the inverse. Use float64, or shift A slightly"
+                    "log|det A|, and the same relative error in the inverse. Use float64, or shift A slightly"
                 )
         return _nan_unless(jnp.isfinite(self.error), function(self.matrix.flat(), jax.lax.stop_gradient(self.factor)))
 
@@ -157,29 +157,29 @@ def factorised(matrix: PatternedOperator, name: str = "matrix") -> FactorisedMat
 
 
 def certain_factorisation(
-    dissection: Dissection, pencil: SymmetricPencil, shift: Float[Array, ""]
+    dissection: Dissection, pencil: SymmetricPencil, shift: Scalar
 ) -> tuple[Factorisation, Trial, Int[Array, ""]]:
     """Factorise K − σM, if necessary again with small pivots replaced; also return the `Trial`, and the tries."""
     probes = jax.random.normal(jax.random.key(0), (pencil.size, _PROBES), shift.dtype)
     bounded, matrix = float(jnp.finfo(shift.dtype).eps) ** _LEAST_PIVOT, pencil.shifted(shift)
 
-    def attempt(tries: Int[Array, ""]) -> tuple[Fields, Trial]:
+    def attempt(tries: Int[Array, ""]) -> tuple[Any, Trial]:
         least = jnp.where(tries > 0, bounded, 0).astype(shift.dtype)
         factor = factorise(dissection, matrix, least)
-        return (factor.downward, factor.upward, factor.pivots), try_out(factor, pencil, shift, probes)
+        return factor.arrays, try_out(factor, pencil, shift, probes)
 
     none = jnp.zeros((), int)
     if is_traced((pencil, shift, none)):
         # A loop compiles the factorisation only once.
         start = jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), jax.eval_shape(attempt, none))
-        tries, (fields, trial) = jax.lax.while_loop(
+        tries, (arrays, trial) = jax.lax.while_loop(
             lambda s: (s[0] < 2) & ~s[1][1].sound, lambda s: (s[0] + 1, attempt(s[0])), (none, start)
         )
     else:
-        tries, (fields, trial) = none + 1, attempt(none)
+        tries, (arrays, trial) = none + 1, attempt(none)
         if not trial.sound:
-            tries, (fields, trial) = none + 2, attempt(none + 1)
-    return Factorisation(dissection, *fields), trial, tries
+            tries, (arrays, trial) = none + 2, attempt(none + 1)
+    return Factorisation(dissection, *arrays), trial, tries
 
 
 def _failure(name: str, pencil: SymmetricPencil, factor: Factorisation) -> str:
@@ -198,18 +198,18 @@ def _failure(name: str, pencil: SymmetricPencil, factor: Factorisation) -> str:
     null = sizes <= _NULL * np.finfo(entries.dtype).eps
     if not null.any():
         return (
-            f"{name}: got a matrix that is singular within rounding of {entries.dtype} (‖Av‖ ≤ {sizes.min():.1e} "
-            "‖A‖ ‖v‖ for some v), or needs pivoting. Shift it, scale rows and columns, or use float64"
+            f"{name}: got a matrix that is singular within rounding of {entries.dtype} (‖Av‖ ≤ {sizes.min():.1e} ‖A‖ "
+            "‖v‖ for some v), or needs pivoting. Shift the matrix, scale rows and columns, or use float64"
         )
     many = f"{'at least ' if null.all() and size < pencil.size else ''}{null.sum()}"
     return (
-        f"{name}: got a singular matrix with {many} null vector(s), ‖Av‖ ≤ {sizes[null].max():.1e} ‖A‖ ‖v‖. "
-        "Shift it, fix as many unknowns, or add a term that is definite on the null space"
+        f"{name}: got a singular matrix with {many} null vector(s), ‖Av‖ ≤ {sizes[null].max():.1e} ‖A‖ ‖v‖. Shift "
+        "the matrix, fix the same number of unknowns, or add a term that is definite on the null space"
     )
 
 
 @jax.jit
-def _norm(matrix: PatternedOperator) -> Float[Array, ""]:
+def _norm(matrix: PatternedOperator) -> Scalar:
     """Return the maximum norm, the largest row sum of absolute values."""
     ones = jnp.ones((matrix.size, 1), matrix.dtype)
     return jnp.max(matrix.with_flat(jnp.abs(matrix.flat())).of_columns()(ones))
@@ -218,21 +218,19 @@ def _norm(matrix: PatternedOperator) -> Float[Array, ""]:
 # A dx = db − dA x. JAX derives all derivatives of a linear solve from the product with A. The solution method does not
 # enter these derivatives.
 @jax.jit
-def _solve(matrix: PatternedOperator, factor: Factorisation, b: Float[Array, "n m"]) -> Float[Array, "n m"]:
+def _solve(matrix: PatternedOperator, factor: Factorisation, b: Columns) -> Columns:
     product, norm = matrix.of_columns(), jax.lax.stop_gradient(_norm(matrix))
     return jax.lax.custom_linear_solve(product, b, partial(_refined, factor, norm), symmetric=True)
 
 
-def _refined(
-    factor: Factorisation, norm: Float[Array, ""], product: OfColumns, b: Float[Array, "n m"]
-) -> Float[Array, "n m"]:
+def _refined(factor: Factorisation, norm: Scalar, product: OfColumns, b: Columns) -> Columns:
     """Solve with iterative refinement, as long as a step at least halves the largest backward error."""
     finfo = jnp.finfo(b.dtype)
 
     def largest(x: Array) -> Float[Array, " m"]:
         return jnp.max(jnp.abs(x), axis=0)
 
-    def measured(x: Array) -> tuple[Array, Array, Float[Array, ""]]:
+    def measured(x: Array) -> tuple[Array, Array, Scalar]:
         rest = b - product(x)
         return x, rest, jnp.max(largest(rest) / (norm * largest(x) + largest(b) + finfo.tiny))
 
@@ -275,7 +273,7 @@ def _inverse_jvp(diagonal: bool, primals: tuple, tangents: tuple) -> tuple[Array
 
 
 @jax.custom_jvp
-def _log_of_pivots(matrix: Float[Array, " m"], factor: Factorisation) -> Float[Array, ""]:
+def _log_of_pivots(matrix: Float[Array, " m"], factor: Factorisation) -> Scalar:
     return jnp.sum(jnp.log(jnp.abs(factor.pivots)))
 
 

@@ -1,17 +1,10 @@
 """Decompositions of single small dense matrices. On CPUs `vmap` becomes a loop, because batched LAPACK calls can hang.
 
 jaxlib 0.10.0 to 0.11.0 distribute a batch of LAPACK calls over the CPU's thread pool, and the calling thread waits for
-them (`ParallelBatchMap`). If the calling threads belong to the pool and occupy all of it, no thread does the work. A
-deadlock needs as many concurrent calls as the pool has threads, for example two independent computations, or two
-devices made from one CPU. On two cores, the smallest program is
-
-    @jax.jit
-    def hangs(factors):  # (2, 64, 32, 32); within the first hundred calls
-        return [solve_triangular(a, jnp.broadcast_to(jnp.eye(32), a.shape), lower=True) for a in factors]
-
-Batched `cholesky`, `eigh`, `inv` or `qr` can hang as well, after a product or with four independent calls. A call on
-one matrix, with less than 2·10⁵ operations, or on a pool of one thread does not wait. So this package calls LAPACK only
-through this file, matrix by matrix. Then a user's own batched call also finds free threads.
+them (`ParallelBatchMap`). If the calling threads belong to the pool and occupy all of it, no thread does the work. On
+two cores, two independent batched calls in one program hang within a hundred calls. A call on one matrix does not wait.
+So this package calls LAPACK only through this file, matrix by matrix. Then a user's own batched call also finds free
+threads.
 """
 
 from collections.abc import Callable

@@ -109,8 +109,8 @@ def _refuse(message: str, primals: tuple, tangents: tuple) -> NoReturn:
 _MESSAGE = (
     "second derivatives of eigenpairs and of their signatures with respect to the tensors, the vertices or the "
     "pencil are not implemented. First derivatives are implemented, and so are their derivatives with respect to "
-    "times and other filter parameters (in the other order, use jax.jvp for the inner derivative). For a Hessian use "
-    "Gauss-Newton products, jax.vjp after jax.jvp of the signature, or central differences of jax.grad"
+    "times and other filter parameters (in the opposite order of derivatives, use jax.jvp for the inner one). For a "
+    "Hessian use Gauss-Newton products, jax.vjp after jax.jvp of the signature, or central differences of jax.grad"
 )
 
 

@@ -34,6 +34,19 @@ def for_each(count: int, step: Callable[[Any, State], State], state: State) -> S
     return state
 
 
+def by_column_ranges(function: Callable[[jax.Array], jax.Array], width: int, x: jax.Array) -> jax.Array:
+    """Replace ranges of columns of x, each at most ``width`` wide, by their images, in place in a compiled function."""
+
+    def replace(start: Any, size: int, x: jax.Array) -> jax.Array:
+        image = function(jax.lax.dynamic_slice_in_dim(x, start, size, axis=1))
+        return jax.lax.dynamic_update_slice_in_dim(x, image, start, axis=1)
+
+    whole, rest = divmod(x.shape[1], width)
+    if whole:
+        x = jax.lax.fori_loop(0, whole, lambda number, x: replace(number * width, width, x), x)
+    return replace(whole * width, rest, x) if rest else x
+
+
 def when(condition: Any, function: Callable[[State], State], state: State) -> State:
     """Return ``function(state)`` if the condition holds, otherwise the state; by `jax.lax.cond` if it is traced."""
     if is_traced(condition):

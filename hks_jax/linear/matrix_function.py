@@ -11,9 +11,9 @@ from jaxtyping import Array, Float
 
 from hks_jax.linear import lapack
 from hks_jax.linear.dense_eigh import checked_standard_form, transposed_solve
+from hks_jax.linear.divided_differences import divided_difference, second_divided_difference
 from hks_jax.linear.linear_map import linear_map, not_differentiable
 from hks_jax.linear.products import matmul
-from hks_jax.signatures.filters import divided_difference, second_divided_difference
 
 Matrix = Float[Array, "n n"]
 Function = Callable[[Any, Any, Array], Array]

@@ -18,8 +18,7 @@ from jaxtyping import Array, Bool, Float, Inexact, Int
 
 from hks_jax.compilation import jit_quickly
 from hks_jax.linear import lapack
-from hks_jax.linear.dissection import Dissection
-from hks_jax.linear.elimination_tree import Level, Merged
+from hks_jax.linear.dissection import Dissection, Level, Merged
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import batched_with_columns, gram, matmul, transposed
 from hks_jax.linear.symmetric_inverse import symmetric_inverses
@@ -27,6 +26,7 @@ from hks_jax.linear.symmetric_inverse import symmetric_inverses
 CONTRACTION = 0.1
 """The largest spectral radius of a factorisation's relative error at which its inertia is accepted."""
 
+Scalar = Float[Array, ""]
 Blocks = tuple[Array, ...]
 """A batch of dense blocks for each level."""
 
@@ -46,6 +46,11 @@ class Factorisation(eqx.Module):
     pivots: Float[Array, "... pivots"]
 
     @property
+    def arrays(self) -> tuple[Blocks, Blocks, Array]:
+        """All arrays but the dissection, because XLA would copy the dissection if compiled functions returned it."""
+        return self.downward, self.upward, self.pivots
+
+    @property
     def negative(self) -> Int[Array, "..."]:
         """The number of negative eigenvalues; by Sylvester's law of inertia, the number of the pencil's below σ."""
         return jnp.sum(self.pivots < 0, axis=-1)
@@ -63,10 +68,10 @@ class Trial(NamedTuple):
 
     sound: Bool[Array, ""]  # whether its inertia equals that of K − σM
     # ‖b − (K − σM)x‖/‖b‖ of solutions x for random b, which estimates the convergence rate of iterative refinement
-    rate: Float[Array, ""]
+    rate: Scalar
     # the largest ‖(K − σM)x − b‖/‖Mx‖ of M-orthonormal solutions x. Residuals of eigenpairs near σ cannot be smaller;
     # measured residuals are 1 to 15 times as large, rarely up to 40 times
-    error: Float[Array, ""]
+    error: Scalar
 
 
 # If the shift is an eigenvalue of a part of the domain, a pivot vanishes. A pivot δ causes Schur complements of size
@@ -74,18 +79,13 @@ class Trial(NamedTuple):
 # perturbs the matrix by at most twice that pivot. Both errors balance near ε^(1/3), which bounds the error of every
 # factorisation (static pivoting, Li and Demmel 1998). In measurements, ε^(3/8) is best for counts. Solves need more
 # accuracy, and small pivots may be harmless, as on a thin domain or with a nearly decoupled component.
-def factorise(
-    dissection: Dissection, matrix: Float[Array, " m"], least: Float[Array, ""] | float = 0.0
-) -> Factorisation:
+def factorise(dissection: Dissection, matrix: Float[Array, " m"], least: Scalar | None = None) -> Factorisation:
     """Factorise a symmetric matrix, without pivoting between fronts; `try_out` measures the accuracy.
 
     The matrix is given by its entries at the places of the pattern, as from `SymmetricPencil.shifted`. Pivots smaller
     than ``least``, relative to the entries of the front, are replaced by it.
     """
-    # Without replacement of pivots, the sizes of the fronts' entries are not needed.
-    least_or_none = None if isinstance(least, float) and least == 0 else jnp.asarray(least, matrix.dtype)
-    # The compiled function does not return the dissection, because XLA would copy it.
-    return Factorisation(dissection, *_eliminate(dissection, matrix, least_or_none))
+    return Factorisation(dissection, *_eliminate(dissection, matrix, least))
 
 
 # Let the computed LDLᵀ be F = A + E, where A = K − σM. If the spectral radius of EF⁻¹ is below one, the matrix
@@ -93,9 +93,7 @@ def factorise(
 # For x = F⁻¹b, the residual b − Ax equals EF⁻¹b, so that repeated solves with residuals are a power iteration. If the
 # first residual is tiny, one step suffices, as a random b has a component of order 1/√n along every direction.
 @jit_quickly()
-def try_out(
-    factor: Factorisation, pencil: SymmetricPencil, shift: Float[Array, ""], b: Float[Array, "n_dof b"]
-) -> Trial:
+def try_out(factor: Factorisation, pencil: SymmetricPencil, shift: Scalar, b: Float[Array, "n_dof b"]) -> Trial:
     """Measure the accuracy of a factorisation with random right-hand sides b."""
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
     tiny = CONTRACTION / math.sqrt(len(b))
@@ -118,7 +116,7 @@ def try_out(
     return Trial((first < tiny) | ((first < CONTRACTION) & (further < CONTRACTION)), first, error)
 
 
-def _error(x: Float[Array, "n b"], image: Float[Array, "n b"], residual: Float[Array, "n b"]) -> Float[Array, ""]:
+def _error(x: Float[Array, "n b"], image: Float[Array, "n b"], residual: Float[Array, "n b"]) -> Scalar:
     """Return `Trial.error`, given solutions x, Mx, and residuals."""
     # Solutions are dominated by the eigenvector nearest to the shift, so the error is measured on orthonormal vectors.
     products = gram(x, image)
@@ -131,7 +129,7 @@ def _error(x: Float[Array, "n b"], image: Float[Array, "n b"], residual: Float[A
 
 @jit_quickly()
 def _eliminate(
-    dissection: Dissection, matrix: Float[Array, " m"], least: Float[Array, ""] | None
+    dissection: Dissection, matrix: Float[Array, " m"], least: Scalar | None
 ) -> tuple[Blocks, Blocks, Float[Array, " pivots"]]:
     """Return the matrices downward and upward, and the pivots."""
     pivots = []
@@ -178,9 +176,8 @@ def eliminate(
     to its boundary, both with the Schur complements of the fronts below added.
     """
     start = list(accumulate((math.prod(level.shape) for level in dissection.levels), initial=0))
-    entries = jnp.zeros(start[-1], matrix.dtype)
     needed = matrix if dissection.entries is None else taken(matrix, dissection.entries)
-    entries = _put(entries, dissection.places, needed)
+    entries = _put(jnp.zeros(start[-1], matrix.dtype), dissection.places, needed)
     padded = _put(entries, dissection.padding, jnp.ones((), entries.dtype))
     eliminated = []
     schur: Array | None = None

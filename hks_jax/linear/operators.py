@@ -2,7 +2,6 @@
 
 from abc import abstractmethod
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -73,20 +72,16 @@ class Operator(eqx.Module):
             raise ValueError(f"@: got an array of shape {x.shape}; expected ({self.size},) or ({self.size}, m)")
         return self.apply(x.T).T
 
+    @jax.jit
     def to_dense(self) -> Float[Array, "n_dof n_dof"]:
         """Return the full matrix."""
-        data, (rows, cols) = self.triplets()
-        return _scattered(data, rows, cols, self.shape)
+        data, places = self.triplets()
+        return jnp.zeros(self.shape, data.dtype).at[places].add(data)
 
     def to_scipy(self) -> csc_matrix:
         """Return the matrix as SciPy CSC, on the host."""
         data, places = self.triplets()
         return coo_matrix((np.asarray(data), places), shape=self.shape).tocsc()
-
-
-@partial(jax.jit, static_argnames="shape")
-def _scattered(data: Float[Array, " nnz"], rows: Any, cols: Any, shape: tuple[int, int]) -> Float[Array, "rows cols"]:
-    return jnp.zeros(shape, data.dtype).at[rows, cols].add(data)
 
 
 class PatternedOperator(Operator):
@@ -241,19 +236,24 @@ def shifted(stiffness: PatternedOperator, mass: Operator, shift: Inexact[Array, 
     return entries.at[stiffness.pattern.diagonal()].add(change, unique_indices=True)
 
 
-def require_symmetric(name: str, values: Any, places: Places, size: int, remedy: str) -> None:
-    """Raise ValueError unless a matrix is finite and symmetric up to rounding. Repeated places add up."""
+def require_symmetric(
+    name: str, values: Any, places: Places, size: int, remedy: str, limit: float | None = None
+) -> None:
+    """Raise ValueError unless a matrix is finite and symmetric. Repeated places add up.
+
+    The limit of asymmetry is relative to the largest entry; None is the level of rounding.
+    """
     data, (rows, cols) = np.asarray(values), places
     wrong = int((~np.isfinite(data)).sum())
     if wrong:
         raise ValueError(f"{name}: {wrong} of {data.size} entries are NaN or infinite; expected finite numbers")
     held = coo_matrix((data, (rows, cols)), shape=(size, size)).tocsr()
     difference = abs(held - held.T).tocoo()
-    largest = float(np.max(np.abs(data), initial=0))
-    if difference.nnz and difference.data.max() > ROUNDING * np.finfo(data.dtype).eps * largest:
+    limit = ROUNDING * float(np.finfo(data.dtype).eps) if limit is None else limit
+    if difference.nnz and difference.data.max() > limit * np.max(np.abs(data)):
         at = int(np.argmax(difference.data))
         i, j = int(difference.row[at]), int(difference.col[at])
         raise ValueError(
             f"{name}: not symmetric: entry ({i}, {j}) is {held[i, j]:.6g}, and entry ({j}, {i}) differs from it by "
-            f"{difference.data[at]:.2g}, which is more than rounding. {remedy}"
+            f"{difference.data[at]:.2g}, more than {limit:.2g} of the largest entry. {remedy}"
         )

@@ -106,11 +106,8 @@ def by_kernels(matrices: Matrices, least: Pivots) -> Inverses:
 
 def by_elimination(matrices: Matrices, least: Pivots) -> Inverses:
     """Sweep the matrices block by block, and each block row by row."""
-
-    def by_rows(blocks: Matrices, least: Pivots) -> Inverses:
-        return jax.vmap(_sweep)(blocks, least[:, None])
-
-    return _by_blocks(by_rows, min(matrices.shape[1], _ROWS), matrices, least)
+    size = min(matrices.shape[1], _ROWS)
+    return _by_blocks(lambda blocks, least: jax.vmap(_sweep)(blocks, least[:, None]), size, matrices, least)
 
 
 def _by_blocks(invert: Callable[[Array, Array], Inverses], size: int, matrices: Matrices, least: Pivots) -> Inverses:
@@ -133,8 +130,8 @@ def _by_blocks(invert: Callable[[Array, Array], Inverses], size: int, matrices: 
 
 
 # Sweeping a block P of A replaces P by −P⁻¹, and the rest by the Schur complement of P. After sweeping all blocks, A
-# has become −A⁻¹. By Sylvester's law of inertia, as many pivots as eigenvalues of A are negative. Let U be the rows of
-# P with P replaced by −I, and let A₀ be A with zeros in the rows and columns of P. Then the swept matrix is
+# has become −A⁻¹. By Sylvester's law of inertia, A has as many negative eigenvalues as negative pivots. Let U be the
+# rows of P with P replaced by −I, and let A₀ be A with zeros in the rows and columns of P. Then the swept matrix is
 # A₀ − UᵀP⁻¹U, which takes two products and one pass over A.
 def _swept(a: Matrices, rows: Float[Array, "m s n"], inverses: Float[Array, "m s s"], at: Int[Array, ""]) -> Matrices:
     """Sweep the block that begins at row ``at``, given its inverse."""

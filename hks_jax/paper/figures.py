@@ -84,7 +84,7 @@ def figure1(full: bool, echo: Callable[[str], None]) -> Figure:
         field.tensors[part, part],
     )
     plot.ellipses(ellipses, quarter, every=n // 50, sizes="fit")
-    ellipses.set_title("metric $f^{*}g$ on the middle of $U$: its unit circles")
+    ellipses.set_title("unit circles of the metric $f^{*}g$ on the middle of $U$")
     plot.scalar_image(domain_hks, on_domain, field.grid, vmin=low, vmax=high, colorbar=False)
     domain_hks.set_title("HKS of the metric on $U$")
     domain_hks.add_patch(Rectangle((np.pi / 2,) * 2, np.pi, np.pi, fill=False, color="white", linestyle="--"))

@@ -102,7 +102,7 @@ def make(full: bool, echo: Callable[[str], None]) -> dict[str, str]:
     lines = [
         "# Edge lengths in the metric, and the triangle inequality",
         "",
-        "The numbers of triangles that violate it for each rule of edge lengths, and of vertices whose circumcentric",
+        "The table counts triangles that violate it, for each rule of edge lengths, and vertices whose circumcentric",
         "dual cell has no positive area (with midpoint lengths).",
         "",
         f"| field | triangles | {' | '.join(LENGTHS)} | vertices | without area |",

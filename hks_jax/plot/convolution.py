@@ -35,7 +35,7 @@ def lic_texture(
         field: a 2D field.
         which: ``"major"``, the eigenvector of the larger eigenvalue of T, or ``"minor"``.
         pixels: the number of pixels along the longer side of the grid.
-        length: the length of the average in each direction, in pixels.
+        length: the length of the average on each side of a pixel, forwards and backwards, in pixels.
         seed: the seed of the noise.
 
     Returns:

@@ -175,7 +175,7 @@ def spectrum(
     lines += ax.plot(fine, law, "--", color="0.5", linewidth=0.9, label=f"Weyl's law, {bulk} alone")
     ax.set_xlim(0, 1.02 * fine[-1])
     ax.set_xlabel(rf"$\lambda${' in ' * bool(unit)}{unit}")
-    ax.set_ylabel(r"$N(\lambda)$ less Weyl's law" if remainder else r"$N(\lambda)$")
+    ax.set_ylabel(r"$N(\lambda)$ minus Weyl's law" if remainder else r"$N(\lambda)$")
     ax.ticklabel_format(useMathText=True)
     ax.tick_params(labelsize=SMALL)
     ax.grid(visible=True, linewidth=0.4, alpha=0.5)

@@ -179,7 +179,7 @@ def colours_of(
 
 
 def shared_colours(images: Sequence[np.ma.MaskedArray], kwargs: dict[str, Any]) -> dict[str, Any]:
-    """Return arguments of `scalar_image` that give equal values in all these images the same colour."""
+    """Return arguments of `scalar_image` with which all these images share one colour scale."""
     values = np.concatenate([image.compressed() for image in images])
     names = ("quantiles", "least_range", "centre", "vmin", "vmax")
     low, high, own = colours_of(values, **{name: kwargs[name] for name in names if name in kwargs})

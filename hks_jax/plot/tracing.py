@@ -123,7 +123,7 @@ def evenly_spaced_lines(
         True
     """
     if not separation > 0:
-        raise ValueError(f"separation: got {separation}; expected a positive length in coordinates")
+        raise ValueError(f"separation: got {separation}; expected a positive length, in the unit of the coordinates")
     h, n_steps = _lengths(field, step, max_length)
     h = min(h, separation / 4)
     seeds = _candidates(field, separation / 2)
@@ -216,7 +216,7 @@ def _lengths(field: TensorField, step: float | None, max_length: float | None) -
     side = max((n - 1) * s for n, s in zip(grid.shape, grid.spacing, strict=True))
     length = 8.0 * side if max_length is None else max_length
     if not (h > 0 and length > 0):
-        raise ValueError(f"step, max_length: got {step}, {max_length}; expected positive lengths in coordinates")
+        raise ValueError(f"step, max_length: got {step}, {max_length}; expected positive lengths in coordinate units")
     return h, max(1, int(np.ceil(0.5 * length / h)))
 
 

@@ -242,7 +242,7 @@ def _turned(
             raise ValueError(f"node: got {node}; expected three indices within the grid's shape {grid.shape}")
         if not inside[node]:
             raise ValueError(
-                f"node: got {node}, which has no value; expected a node with one, such as {middle_node(inside)}"
+                f"node: got {node}, which has no value; expected a node with a value, such as {middle_node(inside)}"
             )
     if orientation is not None:
         node = None if node is None else orientation.node(node, grid.shape)

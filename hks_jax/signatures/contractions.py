@@ -1,16 +1,25 @@
-"""Linear functionals of the kernel Φ C Φᵀ of a spectral function: its diagonal, columns, distances and flows."""
+"""Linear functionals of the kernel Φ C Φᵀ of a spectral function, and the derivative of its diagonal by NumPy."""
 
 from abc import abstractmethod
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.arrays import StaticArray
+from hks_jax.eigen.derivative import change_of
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.products import quadratic_forms
+from hks_jax.signatures.filters import Filter, mixing
+
+_matmul = partial(jnp.matmul, precision="highest")
+_ON_HOST = 1 << 23
+"""The number of entries of the eigenvectors, and of all filters' matrices, up to which NumPy differentiates."""
 
 
 class Contraction(eqx.Module):
@@ -60,11 +69,7 @@ class _Bilinear(Contraction):
 
 
 class Applied(_Bilinear):
-    """The products Φ C Φᵀ w of the kernel with functionals w.
-
-    Attributes:
-        functionals: (s, n) the s functionals w.
-    """
+    """The products Φ C Φᵀ w of the kernel with functionals w."""
 
     functionals: Float[Array, "s n"]
 
@@ -113,5 +118,53 @@ class SquaredDistances(_FromSources):
         return jnp.moveaxis(readings, 0, 1)
 
 
-def _matmul(a: Array, b: Array) -> Array:
-    return jnp.matmul(a, b, precision="highest")
+def shapes(contraction: Contraction, filters: Filter, pairs: tuple[Array, Array, Array], *args: Any) -> Any:
+    """Return the shape and dtype of the derivative."""
+    vectors, m = pairs[1], len(jax.tree.leaves(filters)[0])
+    return jax.eval_shape(contraction.weighted, jax.ShapeDtypeStruct((m, len(vectors)), vectors.dtype), vectors)
+
+
+def by_numpy(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
+    """Return the derivative of a diagonal, or the cotangents of `d_frame` and of the change of the pencil, by NumPy."""
+    contraction, filters, pairs, _, selection, fixed, copies, space, _, reader = known
+    values, vectors, kept = map(np.asarray, pairs)
+    k = len(values) if selection is None else len(selection[0])
+    m = len(jax.tree.leaves(filters)[0])
+    plain = isinstance(contraction, Diagonal) and reader is None and k > 0
+    if x is None or not plain or vectors.size > _ON_HOST or m * k * k > _ON_HOST:
+        return None
+    rows: Any = slice(None)
+    if selection is not None:
+        rows, own = map(np.asarray, selection)
+        values, kept, vectors = values[rows], kept[rows], np.where(own[:, None], vectors[rows], 0)
+    weights, of_f, of_lambda_f, matters = map(
+        np.asarray, mixing(filters, jax.device_put(values), jax.device_put(kept), fixed)
+    )
+    change = x[8]
+    # Only the first n pairs matter, so the symmetric sum over i and j needs only i < n. Terms with j ≥ n count twice.
+    last = [int(np.max(np.flatnonzero(one), initial=-1)) + 1 for one in matters]
+    times = [np.where(np.arange(k) < n, 1, 2) for n in last]
+
+    def transferred(functions: np.ndarray, of: FunctionSpace, to: FunctionSpace) -> np.ndarray:
+        return np.asarray(of.transfer(jax.device_put(functions), to))
+
+    moved = transferred(vectors, space, change.space)
+    if y is None:
+        images = ((matrix.to_scipy() @ moved.T).T for matrix in (change.stiffness, change.mass))
+        stiffness, mass = (copies * transferred(each, change.space, space) @ vectors.T for each in images)
+        d_frame = np.where(kept[:, None], np.asarray(x[3])[rows], 0)
+        result = weights @ (2 * vectors * d_frame)
+        for one, (n, count) in enumerate(zip(last, times, strict=True)):
+            matrix = (of_f[one] * stiffness - of_lambda_f[one] * mass)[:n] * count
+            result[one] += np.sum(vectors[:n] * (matrix @ vectors), axis=0)
+        return result
+    # The transpose of the steps above follows.
+    stiffness, mass = np.zeros((k, k), vectors.dtype), np.zeros((k, k), vectors.dtype)
+    for one, (n, count) in enumerate(zip(last, times, strict=True)):
+        outer = (vectors[:n] * y[0][one]) @ vectors.T * count
+        stiffness[:n] += of_f[one, :n] * outer
+        mass[:n] -= of_lambda_f[one, :n] * outer
+    d_frame = np.zeros(x[3].shape, x[3].dtype)
+    d_frame[rows] = np.where(kept[:, None], 2 * vectors * (weights.T @ y[0]), 0)
+    images = (transferred(copies * each @ vectors, space, change.space) for each in (stiffness, mass))
+    return d_frame, change_of(change, moved, *images)

@@ -26,13 +26,11 @@ from hks_jax.traced import is_traced
 def diffusion_distance(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Array, "n_times n_sources *shape"]:
     """Compute the diffusion distance d_t(x_s, x)² = Σᵢ exp(−2λᵢt) (φᵢ(x_s) − φᵢ(x))² (Coifman and Lafon 2006).
 
+    The unit is 1/(metric length)^(d/2). The result is NaN outside the mask.
+
     Args:
-        pairs: the result of `eigenpairs`.
         times: (n_times,) positive.
         sources: node indices (n_sources, d), or (d,) for one source; vertex numbers on a mesh.
-
-    Returns:
-        (n_times, n_sources, *shape) in 1/(metric length)^(d/2); NaN outside the mask.
 
     Examples:
         >>> k = hj.heat_kernel(pairs, [0.4], [(0, 0), (8, 8)])[0]
@@ -47,12 +45,10 @@ def diffusion_distance(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Arr
 def biharmonic_distance(pairs: Eigenpairs, sources: Any) -> Float[Array, "n_sources *shape"]:
     """Compute the biharmonic distance d(x_s, x)² = Σᵢ (φᵢ(x_s) − φᵢ(x))² / λᵢ² over λᵢ > 0 (Lipman et al. 2010).
 
-    Args:
-        pairs: the result of `eigenpairs`.
-        sources: node indices (n_sources, d), or (d,) for one source; vertex numbers on a mesh.
+    The unit is (metric length)^(2 − d/2). The result is NaN outside the mask.
 
-    Returns:
-        (n_sources, *shape) in (metric length)^(2 − d/2); NaN outside the mask.
+    Args:
+        sources: node indices (n_sources, d), or (d,) for one source; vertex numbers on a mesh.
 
     Raises:
         ValueError: if a source is outside the domain, if it has several components, or if no eigenvalue is positive.
@@ -131,8 +127,8 @@ def varadhan_distance(
 
     Small times need fine grids and many pairs: linear elements with node spacing h have the relative error h²d²/48t² of
     d², and exp(−d²/4t) must exceed the truncation and rounding errors. The result is NaN where the estimated relative
-    error of the kernel or the grid's relative error of d² exceeds 0.1. Larger times reach further, but with larger
-    errors.
+    error of the kernel or the grid's relative error of d² exceeds 0.1, outside the mask, and at Dirichlet nodes. Larger
+    times reach further, but with larger errors.
 
     Args:
         pairs: the result of `eigenpairs`; more pairs reach further. Paths stay in the domain: they go around holes of
@@ -141,10 +137,6 @@ def varadhan_distance(
         sources: node indices (n_sources, d), or (d,) for one source; vertex numbers (n_sources,) on a mesh.
         normalised: whether to divide by the diagonal. Otherwise the result depends on the length unit and is NaN where
             k_t > 1.
-
-    Returns:
-        (n_times, n_sources, *shape) in metric length. Normalised distances are 0 at the source. NaN outside the mask,
-        at Dirichlet nodes and where the distance is not resolved.
 
     Raises:
         ValueError: if times are invalid or if a source is out of range, outside the mask or at a Dirichlet node.
@@ -161,7 +153,7 @@ def varadhan_distance(
     times = resolved_times(pairs, times)
     nodes, space = source_indices(pairs, sources), pairs.space
     if not space.free.ravel()[nodes].all():
-        raise ValueError("sources: got a node on a Dirichlet boundary, where the heat kernel is 0; expected others")
+        raise ValueError("sources: got a node on a Dirichlet boundary, where the kernel is 0; expected inner nodes")
 
     # Values outside the mask are 0, because NaN would enter the derivatives as the product 0·NaN.
     kernel = jnp.where(space.domain, spectral_columns(pairs, Heat(times), nodes), 0)
@@ -232,6 +224,6 @@ def _warn_of_distance(
         remedy = "more eigenpairs (in float64)" if 2 * too_small.sum() >= far.sum() else "a finer grid"
         warn_of_accuracy(
             f"times: {far.mean():.1%} of the distances are NaN, {far[worst].mean():.1%} at t = "
-            f"{float(times[worst]):.4g}, too far from a source for the heat kernel to be resolved. Use larger times "
-            f"or {remedy}"
+            f"{float(times[worst]):.4g}, because the heat kernel is not resolved so far from a source. Use larger "
+            f"times or {remedy}"
         )

@@ -1,4 +1,4 @@
-"""Filters, which are functions f(λ) of the eigenvalue, and their divided differences without cancellation."""
+"""Filters, which are functions f(λ) of the eigenvalue, and the divided differences by which they mix eigenvectors."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -7,94 +7,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-Function = Callable[[Array], Array]
-
-
-def divided_difference(f: Function, low: Float[Array, "*n"], high: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Return f[a, b] = (f(b) − f(a))/(b − a) for a ≤ b, and f'(a) where they are equal.
-
-    This is also the mean of f' over the interval. The difference quotient is inaccurate where a and b are close, and
-    Gauss quadrature of the mean where they are far apart. `_mean_or_quotient` chooses between them.
-    """
-    gap = high - low
-    slope = _derivative(f)
-    coarse, fine = (_mean(slope, low, gap, n) for n in (6, 12))
-    at_low, at_high = f(low), f(high)
-    return _mean_or_quotient(coarse, fine, gap, at_high - at_low, jnp.abs(at_high) + jnp.abs(at_low))
-
-
-# Hermite and Genocchi: f[a, b, c] is the integral of f'' over the triangle of the convex combinations of a, b and c,
-#
-#     f[a, b, c] = ∫₀¹ s ∫₀¹ f''(a + s (b − a) + s u (c − b)) du ds,
-#
-# by Gauss quadrature in both variables. The equal quotient (f[b, c] − f[a, b])/(c − a) is inaccurate for close a, b, c.
-def second_divided_difference(
-    f: Function,
-    low: Float[Array, "*n"],
-    middle: Float[Array, "*n"],
-    high: Float[Array, "*n"],
-    below: Float[Array, "*n"],
-    above: Float[Array, "*n"],
-    scale: Float[Array, ""],
-) -> Float[Array, "*n"]:
-    """Return f[a, b, c] for a ≤ b ≤ c, and f''(a)/2 where they are equal, given f[a, b] and f[b, c].
-
-    The scale is the largest magnitude of f' or [f]. The error of the result is about the rounding error of the scale,
-    also where f' is much smaller, as for f' = 1 − tanh².
-    """
-    curvature = _derivative(_derivative(f))
-
-    def triangle(n: int) -> Array:
-        # Evaluating all points at once shortens compilation.
-        nodes, weights = (np.asarray(numbers) for numbers in gauss(n))
-        s = jnp.asarray(np.repeat(nodes, n), low.dtype).reshape(-1, *(1,) * low.ndim)
-        u = jnp.asarray(np.tile(nodes, n), low.dtype).reshape(s.shape)
-        values = curvature(low + s * (middle - low) + s * u * (high - middle))
-        weight = jnp.asarray(np.outer(weights * nodes, weights).ravel(), low.dtype)
-        return jnp.tensordot(weight, values, 1, precision="highest")
-
-    return _mean_or_quotient(triangle(5), triangle(8), high - low, above - below, scale)
-
-
-def _mean_or_quotient(
-    coarse: Float[Array, "*n"],
-    fine: Float[Array, "*n"],
-    gap: Float[Array, "*n"],
-    change: Float[Array, "*n"],
-    size: Float[Array, "..."],
-) -> Float[Array, "*n"]:
-    """Return the mean if two quadrature rules and the quotient agree to within their errors, otherwise the quotient.
-
-    The quotient is the change divided by the gap. The change is the difference of two terms of the given size.
-    """
-    eps = jnp.finfo(gap.dtype).eps
-    apart = gap > 0
-    smooth = jnp.abs(fine - coarse) * gap <= eps * size
-    # Both rules may miss a sharp transition, which the quotient includes.
-    smooth &= jnp.abs(fine * gap - change) <= jnp.sqrt(eps) * size
-    return jnp.where(~apart | smooth, fine, change / jnp.where(apart, gap, 1))
-
-
-def gauss(n: int) -> tuple[list[float], list[float]]:
-    """Return n Gauss–Legendre nodes and weights on [0, 1]."""
-    nodes, weights = np.polynomial.legendre.leggauss(n)
-    return ((1 + nodes) / 2).tolist(), (weights / 2).tolist()
-
-
-def _derivative(function: Function) -> Function:
-    return lambda x: jax.jvp(function, (x,), (jnp.ones_like(x),))[1]
-
-
-def _mean(function: Function, low: Array, gap: Array, n: int) -> Array:
-    """Return the mean over [low, low + gap] by n-point Gauss quadrature."""
-    nodes, weights = gauss(n)
-    total = jnp.zeros_like(gap)
-    for s, w in zip(nodes, weights, strict=True):
-        total = total + w * function(low + s * gap)
-    return total
+from hks_jax.compilation import jit_quickly
+from hks_jax.linear.divided_differences import divided_difference, gauss
 
 
 class Filter(eqx.Module):
@@ -175,12 +91,7 @@ class Power(Filter):
 
 
 class Custom(Filter):
-    """Any function f(parameters, λ) that JAX differentiates twice.
-
-    Attributes:
-        function: maps (parameters, λ) to f, elementwise in λ.
-        parameters: any pytree of floating point arrays.
-    """
+    """Any function f(parameters, λ) that JAX differentiates twice, elementwise in λ."""
 
     function: Callable[[Any, Array], Array] = eqx.field(static=True)
     parameters: Any
@@ -205,3 +116,36 @@ class Derivative(Filter):
         if type(self.filter).divided_difference is Filter.divided_difference:
             return super().divided_difference(low, high)
         return jax.jvp(lambda f: f.divided_difference(low, high), (self.filter,), (self.direction,))[1]
+
+
+def weights_of(one: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"]) -> Float[Array, " k"]:
+    """Return f(λᵢ), or zero if the pair is not kept."""
+    return jnp.where(kept, one(values), 0)
+
+
+@jit_quickly(static_argnames="fixed")
+def mixing(
+    filters: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"], fixed: bool
+) -> tuple[Float[Array, "m k"], Float[Array, "m k k"], Float[Array, "m k k"], Bool[Array, "m k"]]:
+    """Return f(λᵢ), the divided differences [f] and [λf], and where f or λf' matters, for each filter.
+
+    They do not matter where they are negligible relative to their largest size at positive eigenvalues.
+    """
+    rows, columns = values[:, None], values[None]
+    low, high, gap = jnp.minimum(rows, columns), jnp.maximum(rows, columns), rows - columns
+
+    def of_one(one: Filter) -> tuple[Array, Array, Array, Array]:
+        f = weights_of(one, values, kept)
+        quotient = (f[:, None] - f[None]) / jnp.where(gap == 0, 1, gap)
+        of_f = jnp.where(kept[:, None] & kept[None], one.divided_difference(low, high), quotient)
+        # G vanishes between null vectors that every perturbation annihilates, and f may have no derivative at 0.
+        of_f = jnp.where((high == 0) & (fixed | ~jnp.isfinite(of_f)), 0, of_f)
+        # Using f at the larger eigenvalue, where f is small, avoids cancellation.
+        of_lambda_f = jnp.where(gap >= 0, f[:, None], f[None]) + low * of_f
+        size = jnp.maximum(jnp.abs(f), jnp.abs(values * jnp.diagonal(of_f)))
+        # Between two negligible pairs, [f] is at most f' at one of them or, if f is not monotone, ε over the relative
+        # gap. NaN counts as not negligible.
+        negligible = size <= jnp.finfo(f.dtype).eps * jnp.max(jnp.where(values > 0, size, 0))
+        return f, of_f, of_lambda_f, ~negligible
+
+    return jax.lax.map(of_one, filters)

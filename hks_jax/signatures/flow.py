@@ -10,7 +10,7 @@ import scipy
 from jaxtyping import Array, Float
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.checks import require_real
+from hks_jax.checks import checked_times, require_real
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Heat
@@ -24,15 +24,13 @@ def heat_flow(pairs: Eigenpairs, times: Any, functions: Any) -> Float[Array, "n_
     """Let functions diffuse on the domain: u(t) = Σᵢ exp(−λᵢt) φᵢ ∫φᵢu, the solution of ∂u/∂t = −Δu.
 
     The diffusion is anisotropic where the metric is. The result is differentiable by functions, times and tensors.
+    It is NaN outside the mask, and 0 at Dirichlet nodes.
 
     Args:
         pairs: the result of `eigenpairs`. Their boundary conditions also hold for u. Values of u at Dirichlet nodes are
             not used. ``"mirror"`` and ``"mean"`` extend u evenly, which gives the same flow as ``"neumann"``.
         times: (n_times,) positive, in (metric length)².
         functions: (*shape), or (…, *shape) for several functions; values outside the mask are not used.
-
-    Returns:
-        (n_times, *functions.shape); NaN outside the mask, 0 at Dirichlet nodes.
 
     Raises:
         ValueError: if a time is not positive, or if a function has another shape or is not finite inside the mask.
@@ -76,13 +74,13 @@ def _warn_if_truncated(pairs: Eigenpairs, times: Float[Array, " n_times"], rows:
     if left > TAIL_LIMIT:
         enough = np.log(share / TAIL_LIMIT) / rate
         warn_of_accuracy(
-            f"times: the heat flow at t = {float(jnp.min(times)):.4g} lacks up to {left:.1%} of a function's norm, "
-            f"which lies beyond the computed eigenpairs. Use times of at least {enough:.4g}, or more eigenpairs",
+            f"times: in the heat flow at t = {float(jnp.min(times)):.4g}, up to {left:.1%} of a function's norm "
+            f"belongs to eigenpairs that were not computed. Use times of at least {enough:.4g}, or more eigenpairs",
         )
 
 
 def tensor_invariants(field: TensorField) -> dict[str, Float[np.ndarray, "*shape"]]:
-    """Return the trace, the determinant and the anisotropy of the tensors at the nodes.
+    """Return the ``"trace"``, ``"determinant"`` and ``"anisotropy"`` of the tensors at the nodes; NaN outside the mask.
 
     The anisotropy is (λ₁ − λ₂)/(λ₁ + λ₂) in 2D and the fractional anisotropy (Basser and Pierpaoli 1996) in 3D. Both
     are below 1, and 0 for multiples of the identity.
@@ -91,9 +89,6 @@ def tensor_invariants(field: TensorField) -> dict[str, Float[np.ndarray, "*shape
         field: the tensors on a grid. Pass ``TensorField(Grid(shape), T)`` for an array T (*shape, d, d). For diffusion
             tensors D, whose invariants differ from those of the metric, pass ``TensorField(grid, D)`` or
             ``from_diffusion(grid, D, "tensor")``.
-
-    Returns:
-        ``"trace"``, ``"determinant"`` and ``"anisotropy"``, each a NumPy array (*shape) with NaN outside the mask.
 
     Raises:
         TypeError: if the argument is not a tensor field.
@@ -123,15 +118,12 @@ def gaussian_scale_space(
     """Blur functions by an isotropic Gaussian that is as wide everywhere as the mean spread of heat.
 
     In coordinates the standard deviation is √(2t/s), where s is the mean of |T|^(1/d) over the domain. Division by the
-    blurred mask and reflection at the sides of the grid preserve constant functions.
+    blurred mask and reflection at the sides of the grid preserve constant functions. NaN outside the mask.
 
     Args:
         field: the metric, for its scale, its grid and its mask.
         times: (n_times,) positive, in (metric length)².
         functions: (*shape), or (…, *shape) for several functions; values outside the mask are not used.
-
-    Returns:
-        A NumPy array (n_times, *functions.shape) with NaN outside the mask.
 
     Raises:
         ValueError: if a time is not positive, or if the functions have another shape.
@@ -142,11 +134,8 @@ def gaussian_scale_space(
         1.0 1.0
     """
     grid, d = field.grid, field.grid.dimension
-    require_real("times", times)
     require_real("functions", functions)
-    t, u = np.asarray(times, np.float64), np.asarray(functions, np.float64)
-    if t.ndim != 1 or not (np.isfinite(t) & (t > 0)).all():
-        raise ValueError(f"times: got {times}; expected a vector of positive numbers")
+    t, u = np.asarray(checked_times(times, float)), np.asarray(functions, np.float64)
     if u.shape[u.ndim - d :] != grid.shape:
         raise ValueError(f"functions: got shape {u.shape}; expected {grid.shape}, with optional leading axes")
     inside = grid.inside

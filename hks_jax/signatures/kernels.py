@@ -35,15 +35,11 @@ def heat_trace(pairs: Eigenpairs, times: Any) -> Float[Array, " n_times"]:
 
 
 def heat_kernel(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Array, "n_times n_sources *shape"]:
-    """Compute columns of the heat kernel, k_t(x_s, x) = Σᵢ exp(−λᵢt) φᵢ(x_s) φᵢ(x).
+    """Compute columns of the heat kernel, k_t(x_s, x) = Σᵢ exp(−λᵢt) φᵢ(x_s) φᵢ(x); NaN outside the mask.
 
     Args:
-        pairs: the result of `eigenpairs`.
         times: (n_times,) positive.
         sources: node indices (n_sources, d), or (d,) for one source; vertex numbers (n_sources,) on a mesh.
-
-    Returns:
-        (n_times, n_sources, *shape); NaN outside the mask.
 
     Raises:
         ValueError: if times are invalid, or if a source is out of range or outside the mask.
@@ -63,15 +59,12 @@ def scale_invariant_hks(
 
     Scaling the metric by β shifts τ by log β² and lowers log HKS by a constant. The derivative removes the constant and
     the modulus of the Fourier transform the shift. The default times scale with the spectrum, so invariance is exact.
+    The moduli are dimensionless, and NaN outside the mask and at Dirichlet nodes.
 
     Args:
-        pairs: the result of `eigenpairs`.
         n_frequencies: the number of Fourier moduli, from frequency 0.
         n_times: the number of samples of τ.
         times: (n,) log-spaced times for comparison at absolute scales; by default from 4 ln10/λ_last to 4 ln10/λ₁.
-
-    Returns:
-        (n_frequencies, *shape), dimensionless; NaN outside the mask and at Dirichlet nodes.
 
     Examples:
         >>> nine = hj.eigenpairs(hj.TensorField(field.grid, 9 * field.tensors), k=12)
@@ -96,15 +89,12 @@ def scale_invariant_hks(
 def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Array, "n_energies *shape"]:
     """Compute the wave kernel signature (Aubry, Schlickewei and Cremers 2011, eq. 9).
 
-    WKS(e, x) = Σᵢ φᵢ(x)² exp(−(e − log λᵢ)²/2σ²) / Σᵢ exp(−(e − log λᵢ)²/2σ²) over the positive λᵢ.
+    WKS(e, x) = Σᵢ φᵢ(x)² exp(−(e − log λᵢ)²/2σ²) / Σᵢ exp(−(e − log λᵢ)²/2σ²) over the positive λᵢ,
+    in 1/(metric length)^d; NaN outside the mask.
 
     Args:
-        pairs: the result of `eigenpairs`.
         energies: (n,) values of log λ, by default the 100 values of `default_energies`.
         sigma: the width σ > 0 in log λ, by default the width of `default_energies`.
-
-    Returns:
-        (n_energies, *shape) in 1/(metric length)^d; NaN outside the mask.
 
     Raises:
         ValueError: if only one of energies and sigma is given or one is invalid, or if no eigenvalue is positive.
@@ -149,17 +139,14 @@ def spectral_signature(
     """Compute Σᵢ f(θ, λᵢ) φᵢ(x)², or with sources Σᵢ f(θ, λᵢ) φᵢ(x_s) φᵢ(x), for any f and each of m parameters θ.
 
     The heat kernel signature is ``spectral_signature(pairs, lambda t, x: jnp.exp(-t * x), times)``. Derivatives with
-    respect to the tensors and to θ are exact at eigenvalues of any multiplicity.
+    respect to the tensors and to θ are exact at eigenvalues of any multiplicity. With sources the result is
+    (m, n_sources, *shape); NaN outside the mask.
 
     Args:
-        pairs: the result of `eigenpairs`.
         function: maps (θ, λ) to f elementwise for λ of any shape, and is differentiable by JAX for λ > 0. Pass traced
             values in θ, not by closure. Define the function once, because every new function object is compiled again.
         parameters: θ, a pytree of floating point arrays with a leading axis m.
         sources: None for the diagonal, or node indices (n_sources, d) or (d,); vertex numbers on a mesh.
-
-    Returns:
-        (m, *shape), or (m, n_sources, *shape) with sources; NaN outside the mask.
 
     Raises:
         ValueError: if the parameters have no common leading axis or a source is invalid.
@@ -174,7 +161,7 @@ def spectral_signature(
     parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), parameters)
     shapes = [leaf.shape for leaf in jax.tree.leaves(parameters)]
     if not shapes or len({shape[:1] for shape in shapes}) != 1 or not all(shapes):
-        raise ValueError(f"parameters: got arrays of shapes {shapes}; expected the same first axis, one entry per f")
+        raise ValueError(f"parameters: got arrays of shapes {shapes}; expected equal first axes: one entry per f")
     filters = Custom(function, parameters)
     if sources is None:
         return spectral_diagonal(pairs, filters)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.signatures.filters import gauss
+from hks_jax.linear.divided_differences import gauss
 from hks_jax.signatures.times import dimension_of, positive_range, require_pairs, volume_of
 from hks_jax.signatures.truncation import truncation
 from hks_jax.traced import is_traced
@@ -108,9 +108,6 @@ def log_determinant(
             surface, (0.5, 1) with a curved boundary, none on flat tori and polygons.
         time: T, in (metric length)²; by default the time with the least estimated error.
 
-    Returns:
-        The value with an estimate of its error.
-
     Raises:
         ValueError: if there are fewer than d + 1 coefficients, if a power is not positive, if pairs are in an interval,
             if an eigenvalue is negative or none is positive, or if the dimension is not known.
@@ -155,7 +152,7 @@ def log_determinant(
     if not is_traced(result) and not float(result.error) <= _DOUBTFUL:
         warn_of_accuracy(
             f"pairs: log det′ = {float(result.value):.4g} has the estimated error {float(result.error):.2g}. Use a "
-            "finer grid, more pairs or coefficients, or name the powers of t without one in `extrapolate`"
+            "finer grid, more pairs or coefficients, or name in `extrapolate` the powers of t without a coefficient"
         )
     return result
 

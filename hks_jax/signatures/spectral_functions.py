@@ -19,9 +19,8 @@ from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.linear_map import first_order_only
 from hks_jax.linear.products import even_size, row_blocks
-from hks_jax.signatures.contractions import Applied, Columns, Contraction, Diagonal, SquaredDistances
-from hks_jax.signatures.filters import Custom, Derivative, Filter
-from hks_jax.signatures.mixing import by_numpy, mixing, shapes, weights_of
+from hks_jax.signatures.contractions import Applied, Columns, Contraction, Diagonal, SquaredDistances, by_numpy, shapes
+from hks_jax.signatures.filters import Custom, Derivative, Filter, mixing, weights_of
 from hks_jax.traced import is_traced
 
 _ROWS = 128
@@ -76,12 +75,7 @@ def spectral_flow(
 
 def spectral_trace(pairs: Eigenpairs, filters: Filter) -> Float[Array, " m"]:
     """Return Σᵢ f(λᵢ) for each of m filters. The derivative f'(λᵢ) dλᵢ needs no eigenvector."""
-    return sum_of(filters, pairs.eigenvalues, pairs.kept)
-
-
-def sum_of(filters: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"]) -> Float[Array, " m"]:
-    """Return Σᵢ f(λᵢ) over the kept pairs for each of m filters."""
-    return jnp.sum(_all_weights(filters, values, kept), axis=1)
+    return jnp.sum(_all_weights(filters, pairs.eigenvalues, pairs.kept), axis=1)
 
 
 @jax.custom_jvp
@@ -245,11 +239,7 @@ def _instantiated(tree: Any) -> Any:
 
 
 def source_indices(pairs: Eigenpairs, sources: object) -> Int[np.ndarray, " s"]:
-    """Return flat node indices of sources, given as grid indices (s, d) or (d,), or as vertex numbers (s,) or ().
-
-    Raises:
-        ValueError: if a source has a wrong shape or type, is out of range, or lies outside the mask.
-    """
+    """Return flat node indices of sources, given as grid indices (s, d) or (d,), or as vertex numbers (s,) or ()."""
     shape = pairs.space.node_shape
     array = np.asarray(sources)
     if not np.issubdtype(array.dtype, np.integer):

@@ -1,15 +1,20 @@
-"""Properties of eigenpairs that signatures need, and the default times and energies of Sun et al. and Aubry et al."""
+"""Checks of eigenpairs and times, default times and energies, and times that suit a metric without its eigenpairs."""
 
 import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+import scipy
+from jaxtyping import Array, Bool, Float
 
-from hks_jax.checks import checked_times
+from hks_jax.checks import checked_times, require_count, require_number
 from hks_jax.compilation import numpy_where_known
+from hks_jax.domain.components import label_nodes
 from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.weyl import weyl, weyl_number
+from hks_jax.fem.boundary import BoundarySpec, doubled_problems, normalise_boundary
 from hks_jax.traced import is_traced
 
 
@@ -49,17 +54,14 @@ def _stated(value: Any, name: str, of: str, purpose: str) -> Any:
 
 
 def positive_range(pairs: Eigenpairs) -> tuple[Array, Array]:
-    """Return the first positive and the last eigenvalue.
+    """Return the first positive and the last eigenvalue; raise ValueError if none can be positive.
 
     A multiple eigenvalue is returned as the mean over its multiplet, which is differentiable.
-
-    Raises:
-        ValueError: if no eigenvalue can be positive.
     """
     if _n_positive(require_pairs(pairs)) < 1:
         raise ValueError(
-            f"pairs: got {pairs.k} eigenvalues, none positive (each Neumann component has a zero). Compute more "
-            "eigenpairs"
+            f"pairs: got {pairs.k} eigenvalues, none positive (each component without a Dirichlet side has the "
+            "eigenvalue 0). Compute more eigenpairs"
         )
     return _ends(pairs.eigenvalues, pairs.kept, pairs.multiplet_tolerance)
 
@@ -92,10 +94,8 @@ def default_times(pairs: Eigenpairs, n: int = 16, decay: float = 1e-4) -> Float[
         >>> print((times[0] * pairs.eigenvalues[-1]).round(2), (times[-1] * pairs.eigenvalues[1]).round(2))  # 4 ln 10
         9.21 9.21
     """
-    if n < 1:
-        raise ValueError(f"n: got {n}; expected at least 1")
-    if not 0 < decay < 1:
-        raise ValueError(f"decay: got {decay}; expected a number between 0 and 1")
+    require_count("n", n)
+    require_number("decay", decay, 1)
     first, last = positive_range(pairs)
     end = jnp.minimum(last, first * (math.log(1e-4) / math.log(decay)))
     return 4 * jnp.log(10.0).astype(first.dtype) / jnp.geomspace(last, end, n)
@@ -115,8 +115,61 @@ def default_energies(pairs: Eigenpairs, n: int = 100) -> tuple[Float[Array, " n"
         raise ValueError(f"n: got {n}; expected at least 29, so that the range of energies exceeds 4σ")
     if _n_positive(pairs) < 2:
         raise ValueError(
-            f"pairs: got {_n_positive(pairs)} positive eigenvalue(s); expected at least two, from more eigenpairs"
+            f"pairs: got {_n_positive(pairs)} positive eigenvalue(s); expected at least two. Compute more eigenpairs"
         )
     first, last = (jnp.log(value) for value in positive_range(pairs))
     sigma = 7 * (last - first) / n
     return jnp.linspace(first + 2 * sigma, last - 2 * sigma, n), sigma
+
+
+DEFAULT_K = {2: 200, 3: 100}
+"""The default number of eigenpairs by dimension. It is smaller in 3D, where factorisations cost more."""
+RESOLVED = {2: 4.6, 3: 5.7}
+"""The least λ_k·t, by dimension, at which at most 1 % of the signature lies beyond k pairs (`hks_jax.truncation`)."""
+SHOWN = 1e-2
+"""The decay of the first nonconstant mode at the largest time; a picture still shows this variation."""
+LAST = -math.log(SHOWN)
+"""The value of λ₁·t at the largest time."""
+COARSE = 6.0
+"""The least t/h² at which the grid spacing h biases the signature by at most 1 %."""
+
+
+def default_k(dimension: int, unknowns: int) -> int:
+    """Return the default number of eigenpairs: `DEFAULT_K`, or a quarter of the unknowns if that is less."""
+    return max(1, min(DEFAULT_K[dimension], unknowns // 4))
+
+
+def suitable(metric: Any, spacing: Any, inside: Bool[np.ndarray, "*shape"], boundary: BoundarySpec) -> dict[str, float]:
+    """Return the times and k that suit a metric on a grid; see `suitable_times`.
+
+    The metric (n, d, d) is given at the nodes inside the domain or at a representative sample of them.
+    """
+    metric, spacing = np.asarray(metric), np.asarray(spacing)
+    d, share = len(spacing), inside.sum() / len(metric)
+    boxes = scipy.ndimage.find_objects(label_nodes(inside, (False,) * d)[0].astype(int))
+    steps = np.array([[part.stop - part.start - 1 for part in box] for box in boxes])  # the length of each component
+    along = np.einsum("naa->na", metric) * spacing**2  # the squared distance of neighbours along each axis
+    volume = float(np.sqrt(np.linalg.det(metric)).sum() * np.prod(spacing) * share)
+    size = float(np.sqrt((np.median(along, axis=0) * steps**2).max()))
+    problems = len(doubled_problems(normalise_boundary(boundary, d)))
+    return suitable_times(d, volume, float(np.median(along.max(axis=1))), size, round(len(metric) * share), problems)
+
+
+def suitable_times(
+    dimension: int, volume: float, width2: float, size: float, nodes: int, problems: int = 1
+) -> dict[str, float]:
+    """Return the least times that the spacing and the default k resolve, the k for the former, and the largest time.
+
+    `width2` is the squared distance between neighbouring nodes, and `size` is the domain's length. Under "mean" and
+    "mirror" several problems share the eigenpairs.
+    """
+    least, unknowns = COARSE * width2, problems * nodes
+    k = default_k(dimension, unknowns)
+    return {
+        "least_time": least,
+        "k_for_least_time": math.ceil(weyl_number(RESOLVED[dimension] / least, problems * volume, dimension)),
+        "k": k,
+        "unknowns": unknowns,
+        "least_time_of_k": RESOLVED[dimension] / weyl(k, problems * volume, dimension),
+        "largest_time": LAST * (size / np.pi) ** 2,  # λ₁ of an interval of this length
+    }

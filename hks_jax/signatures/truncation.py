@@ -281,15 +281,11 @@ def truncation_map(
     inside and at Neumann sides, and d/2 + 1 at a Dirichlet side.
 
     The result is an estimate, not a bound. On small grids the largest true share of a node was 0.25 to 2 times the
-    largest estimate if the mean exceeded 0.1 %, and up to 3 times the estimate if the mean was 1e-6.
+    largest estimate if the mean exceeded 0.1 %, and up to 3 times the estimate if the mean was 1e-6. It is NaN outside
+    the mask, and 0 at Dirichlet nodes and if all pairs were computed. Derivatives treat it as a constant.
 
     Args:
-        pairs: the result of `eigenpairs`.
         times: (n_times,) positive, in (metric length)².
-
-    Returns:
-        (n_times, *shape) between 0 and 1, relative to the signature of all pairs. NaN outside the mask; 0 at Dirichlet
-        nodes and if all pairs were computed. Derivatives treat the result as a constant.
 
     Raises:
         ValueError: if times are not positive and finite, or if pairs lie in an interval.

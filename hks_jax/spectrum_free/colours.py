@@ -108,10 +108,13 @@ def error_bound(spacing: tuple[int, ...], degree: int, time: float, limits: Boun
     tails = coefficient_tails(time * limits.top / 2)
     beyond = float(tails[min(degree + 1, tails.size - 1)])
     # The distances of the sources of one colour along each axis, in spacings. All but the first occur twice.
-    steps = [np.arange(_steps(*of_axis)) for of_axis in zip(space.node_shape, spacing, space.periodic, strict=True)]
+    of_axes = zip(space.node_shape, spacing, space.periodic, strict=True)
+    steps = [np.arange(max(n // s, 1) // 2 + 1 if wraps else -(-n // s)) for n, s, wraps in of_axes]
     distances = [s * along for s, along in zip(spacing, steps, strict=True)]
-    of_axes = zip(distances, time * limits.reach, limits.across, strict=True)
-    bounds = [reach_bound(along, reach_time, low, across) for along, reach_time, across in of_axes]
+    bounds = [
+        reach_bound(along, reach_time, low, across)
+        for along, reach_time, across in zip(distances, time * limits.reach, limits.across, strict=True)
+    ]
     decay = reduce(np.minimum.outer, bounds) + beyond
     if low == 1:
         away = reduce(np.maximum.outer, distances)
@@ -142,21 +145,6 @@ def rounding_error(time: float, limits: Bounds, dimension: int, eps: float) -> f
     errors did not grow with the degree and were 0.05 to 0.7 times this estimate in float32.
     """
     return eps * (1 + 1 / limits.low) / _unit(time, limits, dimension)
-
-
-def _steps(n: int, spacing: int, wraps: bool) -> int:
-    """Return the number of distances between sources on an axis, including zero."""
-    if wraps:
-        return max(n // spacing, 1) // 2 + 1
-    return -(-n // min(spacing, n))
-
-
-def least_mass_degree(times: Float[np.ndarray, " m"], limits: Bounds, dimension: int, tolerance: float) -> int:
-    """Return the polynomial degree that inverts the mass to the tolerance at all times; 1 for a lumped mass."""
-    degree = 1
-    while max(mass_error(degree, time, limits, dimension) for time in times) > tolerance:
-        degree += 1
-    return degree
 
 
 def choose(

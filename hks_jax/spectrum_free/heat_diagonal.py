@@ -39,6 +39,8 @@ def hks_spectrum_free(
 
     The result is that of all eigenpairs of the discretisation, at any t. The cost of colouring grows with t/h², whereas
     the cost of eigenpairs falls; selected inversion costs the same at any t. docs/spectrum-free.md derives the bounds.
+    The unit is 1/(metric length)^d. Values are NaN outside the mask, 0 at Dirichlet nodes, and all NaN if a given
+    `Colouring` was made for a smaller largest eigenvalue, or for shorter times.
 
     Args:
         domain: a tensor field on a grid, a mesh of triangles or tetrahedra, or a pencil of either from `assemble`.
@@ -53,10 +55,6 @@ def hks_spectrum_free(
         tolerance: a bound on the error of colouring at every node, relative to the smaller of (4πt)^(−d/2) and the
             largest possible value at a node; with a potential, times exp(−vt), where v is its least value. See
             `Colouring.error` for proofs. Selected inversion does not use it.
-
-    Returns:
-        (n_times, *shape) in 1/(metric length)^d; NaN outside the mask, 0 at Dirichlet nodes. All values are NaN if a
-        given `Colouring` was made for a smaller spectrum or shorter times.
 
     Raises:
         ValueError: if times, tolerance or method are invalid, if the tolerance is below the rounding error (``"auto"``
@@ -95,9 +93,6 @@ def colouring(
         memory: the maximum size of the working vectors in bytes, which limits the number of vectors at once.
         slack: a factor ≥ 1 by which spectrum and reach may grow, for example in later fields of a fit.
 
-    Returns:
-        The static settings, with the error bound at each time.
-
     Raises:
         ValueError: if arguments are invalid, if the tolerance is below the rounding error, if values are traced, or if
             about as many vectors as nodes are needed.
@@ -123,7 +118,7 @@ def _read_as_unknowns(pencil: AnyPencil) -> AnyPencil:
     if any(part.row_sums is not None for part in pencil.parts):
         raise ValueError(
             'domain: got a pencil with the quadrature "cancelling", whose nodal values this method cannot compute; '
-            'expected "gauss". Or compute the signature from eigenpairs'
+            'expected "gauss". Otherwise compute the signature from eigenpairs'
         )
     return pencil
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from itertools import count
 from typing import Literal
 
 import jax
@@ -13,7 +14,7 @@ from hks_jax.fem.pencil import AnyPencil, from_lower_bound
 from hks_jax.fem.space import GridSpace
 from hks_jax.linear.dissection import dissect
 from hks_jax.linear.selected_inversion import inversion_cost
-from hks_jax.spectrum_free.colours import Colouring, choose, least_mass_degree, rounding_error
+from hks_jax.spectrum_free.colours import Colouring, choose, mass_error, rounding_error
 from hks_jax.spectrum_free.rational import pole_pairs
 from hks_jax.spectrum_free.spectrum_bounds import Bounds, bounds, mass_bound
 from hks_jax.traced import is_traced
@@ -71,10 +72,7 @@ def choose_method(pencil: AnyPencil, times: Float[Array, " m"], method: Method, 
 def least_work(pencil: AnyPencil, times: Float[Array, " m"], tolerance: float) -> Colouring | None:
     """Return the colouring if it takes less work than selected inversion, or None.
 
-    Raises:
-        Unattainable: if selected inversion needs too much memory and the domain is a mesh or the tolerance is below the
-            rounding error.
-        ValueError: if values are traced in that case.
+    If selected inversion needs too much memory, a mesh or a tolerance below the rounding error raises `Unattainable`.
     """
     of_inversion = work(None, pencil, times)
     affordable = math.isfinite(of_inversion)
@@ -104,11 +102,9 @@ class Unattainable(ValueError):
 def plan(
     pencil: AnyPencil, times: Float[Array, " m"], tolerance: float, memory: float = 2e9, slack: float = 1.0
 ) -> Colouring:
-    """Return a colouring that is valid for all parts of a pencil.
+    """Return a colouring for all parts of a pencil; raise `Unattainable` if the tolerance is below the rounding error.
 
-    Raises:
-        Unattainable: if the tolerance is below the rounding error.
-        ValueError: if values are traced.
+    Traced values raise ValueError.
     """
     pencil, times = jax.lax.stop_gradient((from_lower_bound(pencil)[0], times))
     if is_traced((pencil, times)):
@@ -129,10 +125,11 @@ def plan(
                 f"t = {concrete.max():.4g}. Use a tolerance of at least {1.25 * rounding:.1e}, float64, or smaller "
                 "times" + (' (or method="selected-inversion")' if math.isfinite(work(None, pencil, times)) else "")
             )
-        needed = least_mass_degree(concrete, limits, space.dimension, (tolerance - rounding) / 2)
-        if needed <= mass_degree:
+        errors = (max(mass_error(m, t, limits, space.dimension) for t in concrete) for m in count(mass_degree))
+        more = next(i for i, error in enumerate(errors) if error <= (tolerance - rounding) / 2)
+        if not more:
             break
-        mass_degree = needed  # the upper bound `top` depends slightly on the degree
+        mass_degree += more  # the upper bound `top` depends slightly on the degree
     # The value needs five blocks of vectors in memory, its derivatives need eight.
     columns = int(min(_COLUMNS, max(1, memory // (8 * space.free.size * times.dtype.itemsize))))
     return choose(concrete, limits, space, tolerance, mass_degree, columns, eps)

@@ -21,23 +21,17 @@ _STEPS, _MASS_STEPS = 50, 200
 class Bounds(NamedTuple):
     """Bounds for the polynomials of a pencil; for concrete values, NumPy numbers in double precision.
 
-    Attributes:
-        top: an upper bound on the eigenvalues of PK.
-        low: a lower bound on the eigenvalues of D⁻¹M, where D has the row sums of M; 1 if the mass is lumped.
-        reach: (d,) for each axis a bound on the eigenvalues of D⁻¹ times the couplings of K across the axis. It is the
-            discrete counterpart of 2 gᵃᵃ/h².
-        across: (d,) for each axis the least β such that the couplings C of M across the axis satisfy −C ⪯ βM. It is 1
-            for a constant metric, and 0 if the mass is lumped.
-        least_mass: the least entry of D.
-        greatest_mass: the greatest entry of D.
+    For each axis, reach bounds the eigenvalues of D⁻¹ times the couplings of K across the axis; it is the discrete
+    counterpart of 2 gᵃᵃ/h². And across is the least β such that the couplings C of M across the axis satisfy −C ⪯ βM;
+    it is 1 for a constant metric, and 0 if the mass is lumped.
     """
 
-    top: Any
-    low: Any
+    top: Any  # an upper bound on the eigenvalues of PK
+    low: Any  # a lower bound on the eigenvalues of D⁻¹M, where D has the row sums of M; 1 if the mass is lumped
     reach: Float[Array | np.ndarray, " d"]
     across: Float[Array | np.ndarray, " d"]
-    least_mass: Any
-    greatest_mass: Any
+    least_mass: Any  # the least entry of D
+    greatest_mass: Any  # the greatest entry of D
 
 
 @jax.jit
@@ -67,7 +61,11 @@ def bounds(pencil: Pencil, low: Float[Array, ""], mass_degree: int) -> Bounds:
     offsets = np.array(list(product((-1, 0, 1), repeat=d)))
     measured = entries[None]
     if not nodal.mass.is_diagonal:
-        measured = jnp.concatenate([measured, _within_lines(nodal.mass.coefficients, offsets)])
+        # M − C has the couplings within the layers of nodes that are perpendicular to the axis. It consists of diagonal
+        # blocks of M and so is positive semidefinite. Then −C = (M − C) − M ⪯ βM, where 1 + β is the greatest
+        # eigenvalue of M⁻¹(M − C).
+        within = (offsets.T == 0).reshape(d, -1, *[1] * d)
+        measured = jnp.concatenate([measured, jnp.where(within, nodal.mass.coefficients, 0)])
 
     def largest(matrix: Float[Array, "offsets *shape"]) -> Float[Array, ""]:
         apply = replace(nodal.stiffness, coefficients=matrix).of_columns()
@@ -82,12 +80,3 @@ def bounds(pencil: Pencil, low: Float[Array, ""], mass_degree: int) -> Bounds:
     sizes = jnp.abs(entries) / nodal.lumped[None]
     reach = jnp.stack([jnp.max(jnp.sum(sizes[np.flatnonzero(offsets[:, a])], axis=0)) for a in range(d)])
     return Bounds(top, low, reach, across, jnp.min(jnp.where(nodal.free, sums, jnp.inf)), jnp.max(sums))
-
-
-# M − C has the couplings within the layers of nodes that are perpendicular to the axis. It consists of diagonal blocks
-# of M and so is positive semidefinite. Then −C = (M − C) − M ⪯ βM, where 1 + β is the greatest eigenvalue of M⁻¹(M −
-# C).
-def _within_lines(mass: Float[Array, "offsets *shape"], offsets: np.ndarray) -> Float[Array, "d offsets *shape"]:
-    """Return the matrix M − C of each axis for a consistent mass."""
-    d = offsets.shape[1]
-    return jnp.where((offsets.T == 0).reshape(d, -1, *[1] * d), mass, 0)

@@ -179,7 +179,7 @@ class TensorNoise(eqx.Module):
             found.append(np.abs(middle[three]).ravel())
         level = _NORMAL * float(np.median(np.concatenate(found))) / math.sqrt(1.5) if np.concatenate(found).size else 0
         if not level > 0:
-            raise ValueError("tensors: got no noise at most nodes; give a level to `TensorNoise.relative`")
+            raise ValueError("tensors: got no noise at the majority of nodes; give a level to `TensorNoise.relative`")
         return cls.relative(values, level, grid)
 
     def __repr__(self) -> str:

@@ -130,7 +130,7 @@ class Uncertainty(eqx.Module):
             return []
         return [
             f"no intervals are claimed for {int((~claimed).sum())} of {claimed.size} numbers or maps: the effect of "
-            "noise is beyond linear, or the bias exceeds the deviation (see `trusted`). Smooth the tensors (smoothing=)"
+            "noise is not linear, or the bias exceeds the deviation (see `trusted`). Smooth the tensors (smoothing=)"
         ]
 
     def summary(self) -> str:
@@ -143,7 +143,7 @@ class Uncertainty(eqx.Module):
         sure = f", with a relative error of {self.sampling_error:.0%}" if self.sampling_error else ""
         lines = [f"{how}{sure}; {self.draws} noisy maps"]
         share = jax.tree.map(jnp.divide, self.bias, self.deviation)
-        for name, each in (("bias over deviation", share), ("beyond linear", self.beyond_linear)):
+        for name, each in (("bias divided by deviation", share), ("beyond linear", self.beyond_linear)):
             values = np.concatenate([np.asarray(leaf).ravel() for leaf in jax.tree.leaves(each)])
             values = values[np.isfinite(values)]
             if values.size:

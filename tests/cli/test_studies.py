@@ -379,7 +379,7 @@ def test_a_subject_is_done_again_when_its_sidecar_changes(study):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("id\tfile\n1\tt.nii\n", "got the columns id, file; expected a column participant_id"),
+        ("id\tfile\n1\tt.nii\n", "got the columns id, file; expected a column named participant_id"),
         ("participant_id\tfile\nsub-1\ta\n1\tb\n", "two rows for sub-1"),
         ("participant_id\tfile\nsub-a_b\ta\n", "only letters and digits"),
         ("participant_id,file\n", "separated by tabs"),
@@ -407,7 +407,11 @@ def test_rows_join_the_options_of_the_command(tmp_path):
     assert (first.arguments.file, first.arguments.spacing) == (tmp_path / "a.npz", [1.0, 2.0])
     assert (first.arguments.b_max, second.arguments.b_max, second.arguments.erode) == (900, 1000, 2)
     assert (second.arguments.file, second.arguments.mask) == (Path("/b.npz"), tmp_path / "m.npy")
-    assert (first.arguments.mask, bad.arguments, empty.problem) == (None, None, "got no file; expected one per row")
+    assert (first.arguments.mask, bad.arguments, empty.problem) == (
+        None,
+        None,
+        "got no file; expected a file in every row",
+    )
     assert "--spacing: invalid float value: 'x'" in bad.problem
 
 
@@ -660,7 +664,10 @@ def test_a_study_has_errors_of_regions_and_computes_again_what_had_other_noise(s
     assert "1 of 2 subjects are already done" in capsys.readouterr().err
     changed = {name for name, content in contents(study / "out").items() if before[name] != content}
     assert {name.split("/")[0] for name in changed} == {"sub-01", "group_regions.tsv"}
-    for more, text in ((["--noise", "second.nii.gz"], "a column noise"), (["--method", "auto"], "expected spectral")):
+    for more, text in (
+        (["--noise", "second.nii.gz"], "a column named noise"),
+        (["--method", "auto"], "expected spectral"),
+    ):
         assert main([*words, *more]) == 2
         assert text in capsys.readouterr().err
 

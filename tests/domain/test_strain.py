@@ -175,7 +175,7 @@ def test_indefinite_tensors_are_refused_with_the_maps(tmp_path, capsys):
     least = np.linalg.eigvalsh(STRESS[MASK]).min()
     with pytest.raises(ValueError, match=rf"least eigenvalue is {least:g}; expected more than {-least:g}"):
         hj.TensorField.from_indefinite(grid, STRESS, "shift", 0.1)
-    with pytest.raises(ValueError, match=r"the scale 0\.01 of .* the metric is singular in float64"):
+    with pytest.raises(ValueError, match=r"the scale 0\.01 for .* the metric is singular in float64"):
         hj.TensorField.from_indefinite(grid, STRESS, "exp", 0.01)
 
     file, out = tmp_path / "stress.npz", tmp_path / "out"
@@ -192,7 +192,7 @@ def test_indefinite_tensors_are_refused_with_the_maps(tmp_path, capsys):
     assert main([*arguments, "--positive", "exp", "--metric", "tensor"]) == 2
     assert "such as exp:2e6" in capsys.readouterr().err
     assert main([*arguments, "--positive", "shift:0.5"]) == 2
-    assert "--positive: got the shift 0.5 of tensors whose least eigenvalue" in capsys.readouterr().err
+    assert "--positive: got the shift 0.5 for tensors whose least eigenvalue" in capsys.readouterr().err
     assert main([*arguments, "--positive", "exp:2", "--repair", "clip"]) == 2
     assert "got both" in capsys.readouterr().err
 

@@ -168,16 +168,15 @@ def test_components_on_a_basis_in_pieces(rng, dtype, accuracy, size):
 def test_eigenvalues_found_beyond_those_wanted_are_forgotten():
     plan = Plan(wanted=5, block=2, slice_size=5, max_slices=9, tolerance=1e-8, nulls=1)
     values = jnp.asarray(np.random.default_rng(0).permutation(plan.capacity).astype(float))
-    state = jax.eval_shape(partial(first_state, plan=plan), expected(hj.assemble(flat((12, 12), (1.0, 1.0))), plan))
+    problem = expected(hj.assemble(flat((12, 12), (1.0, 1.0))), plan)
+    state, _ = jax.eval_shape(partial(first_state, plan=plan), problem)
     state = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), state)
-    state = state._replace(
-        values=values, vectors=values[:, None] * jnp.ones((1, 144)), known=jnp.asarray(plan.capacity)
-    )
+    state = state._replace(values=values, known=jnp.asarray(plan.capacity))
     assert crowded(plan, state)
-    state = make_room(plan, state)
+    state, vectors = make_room(plan, state, values[:, None] * jnp.ones((1, 144)))
     assert not crowded(plan, state)
     np.testing.assert_array_equal(state.values[: int(state.known)], np.arange(int(state.known)))
-    np.testing.assert_array_equal(state.vectors[:, 0][: int(state.known)], np.arange(int(state.known)))
+    np.testing.assert_array_equal(vectors[:, 0][: int(state.known)], np.arange(int(state.known)))
     assert np.isinf(state.values[int(state.known) :]).all()
 
 
@@ -197,15 +196,16 @@ def test_a_shift_where_a_front_is_singular_is_moved(rng):
     singular = of_one_half(pencil)[5]
     plan = hj.BlockLanczos(block=4).plan(20, pencil.space.n_null)
     whole = expected(pencil, plan)
-    state = first_state(whole, plan)._replace(shift=jnp.asarray(singular))
-    _, searchable, state = cut(whole, dissection, plan, state)
+    state, vectors = first_state(whole, plan)
+    state = state._replace(shift=jnp.asarray(singular))
+    _, searchable, (state, vectors) = cut(whole, dissection, plan, state, vectors)
     assert not searchable
     assert state.moved == 1
     assert state.below == -1
     assert 0.8 * singular < state.shift < singular
-    factor, searchable, state = cut(whole, dissection, plan, state)
+    factor, searchable, both = cut(whole, dissection, plan, state, vectors)
     assert searchable
-    state = search(whole, factor, plan, state)
+    state, _ = search(whole, factor, plan, both)
     assert state.known > 0
     assert np.isfinite(state.start).all()
 

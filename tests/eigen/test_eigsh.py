@@ -1,5 +1,7 @@
 """Eigenpairs of sparse matrices that are none of ours."""
 
+from types import SimpleNamespace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -185,9 +187,9 @@ def test_what_is_refused():
         hj.eigsh(skewed, M, 3)
     almost = K.tolil()
     almost[3, 4] += 1e-9
-    with pytest.raises(ValueError, match=r"entry .* differs from it by 1e-09, which is more than rounding"):
+    with pytest.raises(ValueError, match=r"entry .* differs from it by 1e-09, more than 2.2e-13 of"):
         hj.eigsh(almost, k=3)
-    with pytest.raises(ValueError, match=r"M: got the number 6; .* If it is k, pass k=6"):
+    with pytest.raises(ValueError, match=r"M: got the number 6; .* If this is k, pass k=6"):
         hj.eigsh(K, 6)
     with pytest.raises(ValueError, match=r"K: got float128, .* \.astype\(np.float64\)"):
         hj.eigsh(K.astype(np.longdouble), k=3)
@@ -295,8 +297,9 @@ def test_a_vector_found_twice_has_not_converged(rng):
     vectors = pairs.vectors.at[9].set(pairs.vectors[8])
     twice = measure_pairs(pencil, vectors, pairs.eigenvalues)[2]
     np.testing.assert_array_equal(twice, np.arange(k) == 9)
-    on_host = measured_on_host(pencil, np.asarray(vectors), np.asarray(pairs.eigenvalues))
-    np.testing.assert_array_equal(on_host[1], twice)
+    matrices = SimpleNamespace(stiffness=pencil.stiffness.to_scipy(), mass=pencil.mass.to_scipy())
+    on_host = measured_on_host(matrices, np.asarray(vectors), np.asarray(pairs.eigenvalues))
+    np.testing.assert_array_equal(on_host[2], twice)
 
 
 @pytest.mark.slow

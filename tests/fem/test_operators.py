@@ -313,7 +313,7 @@ def test_forms_on_a_surface_see_space(rng):
 def test_what_is_true_of_the_laplacian_alone_is_left_out():
     pencil = hj.assemble(euclidean(17, 4.0), potential=square)
     pairs = hj.eigenpairs(pencil, 10)
-    with pytest.raises(ValueError, match="problem: got one with a potential"):
+    with pytest.raises(ValueError, match="problem: got an operator with a potential"):
         hj.weyl_count(pencil, [3.0])
     estimate = hj.truncation(pairs, [0.3])
     assert np.isnan(estimate.resolution_bias[0])
@@ -359,7 +359,7 @@ def first_order(u, v, w):
         ({"stiffness": first_order, "potential": 1.0}, "potential: got a field with your own form"),
         ({"stiffness": "laplace"}, "stiffness: got str; expected a form"),
         ({"mass": "full"}, 'mass: got \'full\'; expected "consistent", "lumped" or a form'),
-        ({"fields": {"a": 1.0}}, "got one of them without your own form"),
+        ({"fields": {"a": 1.0}}, "got them without your own form"),
         ({"stiffness": elasticity, "components": 2, "boundary": "mirror"}, 'got "mirror" with components'),
         ({"degree": 2}, "degree, midpoints: got 2 for a grid"),
     ],
@@ -373,7 +373,9 @@ def test_what_cannot_be_looked_at_becomes_nan():
     field = flat((5, 5), (1.0, 1.0))
     unsymmetric = jax.jit(lambda s: hj.assemble(field, stiffness=first_order, fields={"s": s}).stiffness.coefficients)
     assert np.isnan(unsymmetric(1.0)).any()
-    with pytest.raises(ValueError, match="stiffness: the form closes over traced values; pass them as fields="):
+    with pytest.raises(
+        ValueError, match="stiffness: the form closes over traced values; pass these, also numbers, as fields="
+    ):
         jax.grad(lambda c: hj.assemble(field, stiffness=lambda u, v, w: c * u.value * v.value).stiffness.flat()[0])(1.0)
     negative = jax.jit(lambda rho: hj.eigenpairs(hj.assemble(field, density=rho), 3).result)
     assert negative(-1.0) == hj.RESULTS.not_finite

@@ -17,7 +17,7 @@ from hks_jax.io.tensor_order import pack
 
 SHAPE = (26, 24, 14)
 SPACING = (2.0, 1.8, 2.5)
-WRONG = "Wrong frame? Principal directions differ from those of the two neighbours along them by "
+WRONG = "Wrong frame? Principal directions differ from the mean direction of their two neighbours along the fibre by "
 
 
 def positions():

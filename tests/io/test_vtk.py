@@ -121,7 +121,7 @@ def test_what_is_left_open_is_refused(tmp_path, tensors):
     np.testing.assert_allclose(read_tensors(path, "vtk", array="E").tensors, 2 * tensors)
     with pytest.raises(ValueError, match="named 'F'"):
         read_tensors(path, "vtk", array="F")
-    with pytest.raises(ValueError, match="only npz and VTK files have arrays by name"):
+    with pytest.raises(ValueError, match="only npz and VTK files have named arrays"):
         read_tensors("t.nii", array="F")
 
 

@@ -138,8 +138,8 @@ def test_bad_matrices_are_refused_by_name(rng):
     missing[2, 3] = np.nan
     with unchecked():
         for value, message in (
-            (skew, r"A: got .* in row 1, column 4, and .* in row 4, column 1; .* Pass \(A \+ A.T\) / 2"),
-            (missing, "A: got nan in row 2, column 3; expected finite numbers"),
+            (skew, r"A: not symmetric: entry \(1, 4\) is .*, and entry \(4, 1\) differs .* Pass \(A \+ A.T\) / 2"),
+            (missing, "A: 1 of .* entries are NaN or infinite; expected finite numbers"),
             (A[:3], r"A: got shape \(3, 7\); expected \(n, n\)"),
             (np.stack([A, A]), r"A: got shape \(2, 7, 7\); expected \(n, n\)\. Use jax.vmap"),
             (A + 0j, "A: got complex numbers"),
@@ -147,7 +147,7 @@ def test_bad_matrices_are_refused_by_name(rng):
         ):
             with pytest.raises(ValueError, match=message):
                 hj.eigh(value)
-        with pytest.raises(ValueError, match=r"B: got .* expected a matrix that is symmetric"):
+        with pytest.raises(ValueError, match="B: not symmetric"):
             hj.eigh(A, skew)
         with pytest.raises(ValueError, match=r"B: got float32\[7, 7\]; expected float64\[7, 7\], as for A"):
             hj.eigh(A, A.astype(np.float32))

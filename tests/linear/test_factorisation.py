@@ -14,8 +14,7 @@ from jax.experimental.sparse import BCOO
 from pencils import directions, graph_laplacian, indefinite
 
 import hks_jax as hj
-from hks_jax.linear.dissection import dissect
-from hks_jax.linear.elimination_tree import merged
+from hks_jax.linear.dissection import dissect, merged
 from hks_jax.linear.factorised_matrix import factorised
 from hks_jax.linear.multifrontal import factorise
 

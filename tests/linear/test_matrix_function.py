@@ -15,7 +15,7 @@ from differences import directional
 from scipy import linalg
 
 import hks_jax as hj
-from hks_jax.signatures.filters import divided_difference, second_divided_difference
+from hks_jax.linear.divided_differences import divided_difference, second_divided_difference
 
 SPECTRA = {
     "identity": [1.0] * 5,
@@ -233,6 +233,6 @@ def test_errors():
         for f in (lambda x: jnp.stack([x, x]), lambda x: jax.lax.complex(x, x), lambda x: (x, x)):
             with pytest.raises(ValueError, match=r"f: returned .* for one eigenvalue; expected a real scalar"):
                 hj.matrix_function(jnp.eye(2), f)
-        with pytest.raises(ValueError, match=r"A: got .* expected a matrix that is symmetric"):
+        with pytest.raises(ValueError, match="A: not symmetric"):
             hj.matrix_function(np.array([[1.0, 2.0], [3.0, 4.0]]), jnp.exp)
     assert np.isnan(hj.matrix_function(-jnp.eye(2), jnp.log)).any()

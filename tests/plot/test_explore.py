@@ -96,7 +96,7 @@ def test_three_dimensions_have_fractional_anisotropy_and_powers_of_three_halves(
     [
         ({"times": TIMES[::-1]}, "times: got"),
         ({"values": signature()[1:]}, r"values: got shape \(6, 24, 18\)"),
-        ({"values": np.full((7, *SHAPE), np.nan)}, "finite at all times"),
+        ({"values": np.full((7, *SHAPE), np.nan)}, "finite values at all times"),
         ({"tensors": tensors()[1:]}, r"tensors: got shape"),
         ({"tensors": np.full((*SHAPE, 2, 2), np.nan)}, "tensors: got NaN or infinite"),
         ({"maps": {"age": np.ones(3)}}, r"maps\['age'\]: got shape \(3,\)"),

@@ -266,7 +266,7 @@ def test_a_background_that_is_filled_in_is_named_and_left_out_if_asked(value, wo
     assert main(["info", str(path), "--json"]) == 0
     captured = capsys.readouterr()
     assert f"no mask given: {int((~inside).sum())} of 480 voxels {words}" in captured.err
-    assert "Pass --mask, or --background outside, or inside" in captured.err
+    assert "Pass --mask or --background outside, or --background inside" in captured.err
     assert json.loads(captured.out)["inside"] == 480
     for said, count in (("outside", int(inside.sum())), ("inside", 480)):
         assert main(["info", str(path), "--json", "--background", said]) == 0

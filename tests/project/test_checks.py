@@ -72,7 +72,6 @@ OTHERS = {
     "tolerance of colouring": ("tolerance", lambda v: hj.colouring(FIELD, [0.1], tolerance=v)),
     "memory": ("memory", lambda v: hj.colouring(FIELD, [0.1], memory=v)),
     "slack": ("slack", lambda v: hj.colouring(FIELD, [0.1], slack=v)),
-    "spare": ("spare", lambda v: hj.ChebyshevFilter(spare=v)),
     "tolerance of Search": ("tolerance", lambda v: Search(tolerance=v)),
     "noise": ("noise", lambda v: Data(noise=v)),
     "spread": ("spread", lambda v: Search(spread=v)),

@@ -80,7 +80,7 @@ def test_flow_errors_and_warnings(field):
     with pytest.raises(ValueError, match="functions: got 11 NaN or infinite values inside the mask"):
         hj.heat_flow(pairs, TIMES, np.full(SHAPE, np.nan))
     rough = np.indices(SHAPE).sum(axis=0) % 2.0
-    with pytest.warns(hj.AccuracyWarning, match=r"heat flow at t = 0.02 lacks up to [1-9]"):
+    with pytest.warns(hj.AccuracyWarning, match=r"heat flow at t = 0.02, up to [1-9]"):
         hj.heat_flow(pairs, TIMES, rough)
     hj.heat_flow(pairs, TIMES, pairs.eigenfunctions[1])  # nothing of it is missing
 
@@ -123,7 +123,7 @@ def test_smoothing_keeps_constants_and_masks():
     np.testing.assert_allclose(blurred[:, 0, mask], 3)
     np.testing.assert_allclose(blurred[1, 1, mask], u[1][mask].mean(), rtol=1e-4)
     assert np.abs(blurred[0, 1, mask] - u[1][mask]).max() < 1
-    with pytest.raises(ValueError, match=r"times: got 1\.0; expected a vector"):
+    with pytest.raises(ValueError, match=r"times: got shape \(\); expected a non-empty 1-D array"):
         hj.gaussian_scale_space(field, 1.0, u)
     with pytest.raises(ValueError, match=r"functions: got shape \(18, 20\)"):
         hj.gaussian_scale_space(field, [1.0], u[0].T)

@@ -213,7 +213,7 @@ def test_a_geometry_that_is_lacking_is_named():
     ):
         with pytest.raises(ValueError, match=rf"without the {lacking} of .*`sparse_pencil\("):
             signature()
-    with pytest.raises(ValueError, match="problem: got one without dimension or volume"):
+    with pytest.raises(ValueError, match="problem: got matrices without dimension or volume"):
         hj.weyl_count(pairs, [1.0])
     with pytest.raises(ValueError, match="domain: got a stiffness K with an unknown null space"):
         hj.hks(pairs, TIMES, method="spectrum-free")

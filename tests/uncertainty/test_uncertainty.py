@@ -171,7 +171,7 @@ def test_what_is_beyond_linear_or_indefinite_is_said(rng):
     D = random_spd(rng, (30, 30), 0.1)
     bars = quietly(spd.inverse, D, hj.TensorNoise.relative(D, 0.15), draws=8)
     assert not np.any(bars.trusted)
-    assert "beyond linear" in bars.messages()[0]
+    assert "not linear" in bars.messages()[0]
     bars = quietly(spd.inverse, D, hj.TensorNoise.relative(D, 0.5), draws=8)
     assert "indefinite" in bars.messages()[0]
     assert np.isfinite(bars.deviation).all()

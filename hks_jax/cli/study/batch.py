@@ -9,7 +9,7 @@ Compute the signatures of many subjects at the same times, and tables of their r
   {files}
                    more files of the subject, optional; paths are relative to the table's folder
   {columns}
-                   options that differ between subjects, optional; a file of noise is relative to the table's folder
+                   options that differ between subjects, optional; paths of noise are relative to the table's folder
 
 Other columns, such as age and group, are copied to participants.tsv. The values in a row replace the values of the
 command's options.
@@ -18,8 +18,8 @@ DIR becomes a BIDS derivative. It contains for each subject an image with its si
 and stats, a picture, and with --atlas a table of regions. The tables group_summary.tsv and group_regions.tsv contain
 all subjects.
 
-If no living tissue has the mean diffusivity of a subject in mm2/s, the subject fails unless --unit, or the column unit,
-gives the unit, because subjects with different units cannot be compared.
+If the mean diffusivity of a subject, in mm2/s, is outside the range of living tissue, the subject fails until --unit or
+a column named unit gives the unit, because subjects with different units cannot be compared.
 
 If a subject fails, the others are still computed. If the command is repeated, it computes only the signatures and
 tables that are missing, or whose input files have changed.
@@ -54,7 +54,7 @@ from hks_jax.io import TensorVolume
 from hks_jax.io.result import recorded_boundary
 from hks_jax.io.tables import read_json
 from hks_jax.io.units import LIVING_TISSUE
-from hks_jax.signatures.suitable import LAST
+from hks_jax.signatures.times import LAST
 
 OPTIONS = f"""
 subjects SUBJECTS  the table of subjects
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace, _: Progress) -> None:
 
     if second_scan(args) is not None:
         why = "for all subjects; expected a number, residuals or roughness"
-        raise ValueError(f"--noise: got {args.noise} {why}. Put second scans into a column noise of the table")
+        raise ValueError(f"--noise: got {args.noise} {why}. Put second scans into a column named noise of the table")
     args.strict_unit = True
     if settle := args.boundary is None:  # comparable subjects need the same condition, with or without a mask
         before = {} if args.replace else read_json(args.output / "study.json")
@@ -91,7 +91,7 @@ def run(args: argparse.Namespace, _: Progress) -> None:
             require_spectral(subject.arguments)
     with_regions = any(s.arguments is not None and s.arguments.atlas is not None for s in subjects)
     if not with_regions:
-        refuse(args, ("names",), "this option names labels, which are missing; pass --atlas, or add a column atlas")
+        refuse(args, ("names",), "this option names labels, which are missing; pass --atlas, or a column named atlas")
     progress = StudyProgress(len(chosen), args.quiet)
     if settle:
         progress.end(f"boundary {args.boundary} for all subjects, because --boundary is not given")
@@ -131,7 +131,7 @@ def _other_units(study: Study, done: list[Subject]) -> dict[str, str]:
     span = LIVING_TISSUE[1] / LIVING_TISSUE[0]
     return {
         name: f"--unit: got a median mean diffusivity of {value:.3g}, but the median of the study is {middle:.3g}; "
-        "expected the same unit for all subjects. Give the units by --unit or by a column unit"
+        "expected the same unit for all subjects. Give the units by --unit or by a column named unit"
         for name, value in medians.items()
         if not 1 / span <= value / middle <= span
     }

@@ -65,7 +65,7 @@ def read_subjects(path: Path, common: argparse.Namespace) -> list[Subject]:
     subjects: dict[str, Subject] = {}
     if not any("participant_id" in row for row in rows):
         names = ", ".join(dict.fromkeys(name for row in rows for name in row))
-        raise ValueError(f"{path}: got the columns {names or 'none'}; expected a column participant_id")
+        raise ValueError(f"{path}: got the columns {names or 'none'}; expected a column named participant_id")
     for number, row in enumerate(rows, 2):
         if "participant_id" not in row:
             raise ValueError(f"{path}: got no participant_id in row {number}; expected one in every row")
@@ -74,7 +74,7 @@ def read_subjects(path: Path, common: argparse.Namespace) -> list[Subject]:
         words, covariates = _words(path.parent, row)
         try:
             if not words or words[0].startswith("--"):
-                raise ValueError("got no file; expected one per row")
+                raise ValueError("got no file; expected a file in every row")
             arguments, problem = parser.parse_args(words, copy.copy(common)), ""
             if second_scan(arguments) is not None:
                 arguments.noise = str(path.parent / arguments.noise)
@@ -82,7 +82,7 @@ def read_subjects(path: Path, common: argparse.Namespace) -> list[Subject]:
             arguments, problem = None, str(error)
         subject = Subject(participant, session, arguments, problem, covariates)
         if subject.name in subjects:
-            raise ValueError(f"{path}: got two rows for {subject.name}. Distinguish them by a column session_id")
+            raise ValueError(f"{path}: got two rows for {subject.name}. Distinguish them by a column named session_id")
         subjects[subject.name] = subject
     return list(subjects.values())
 

@@ -2,15 +2,15 @@
 
 Derivatives of a truncated spectrum need linear solves with K − λᵢM on the M-orthogonal complement of the p lowest
 eigenvectors. On this complement, K − σM is positive definite for *every* σ below the next eigenvalue Λ, even if it is
-indefinite on the whole space. Preconditioned with K − σM, the spectrum of K − λᵢM lies between 1 and (Λ − λᵢ)/(Λ − σ).
-So right-hand sides (rows) are grouped by λᵢ, and each group has its own shift σ. A few factorisations then suffice for
-fast convergence of all rows. `HostAdjoint` uses SciPy's factorisations, `FactorisedAdjoint` those in JAX, and
-`FilteredAdjoint` a polynomial.
+indefinite on the whole space. If K − λᵢM is preconditioned with K − σM, its spectrum lies between 1 and
+(Λ − λᵢ)/(Λ − σ). So right-hand sides (rows) are grouped by λᵢ, and each group has its own shift σ. A few factorisations
+then suffice for fast convergence of all rows. `HostAdjoint` uses SciPy's factorisations, `FactorisedAdjoint` those
+in JAX, and `FilteredAdjoint` a polynomial.
 """
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, ClassVar, Generic
+from typing import Any, Generic
 
 import equinox as eqx
 import jax
@@ -53,11 +53,9 @@ class Adjoint(eqx.Module, Generic[P]):
     Every eigensolver has a default in its field ``adjoint``; any other that supports the pencil may replace it.
 
     Attributes:
-        warns: whether `solve` itself warns of rows that do not converge, even if values are traced.
         tolerance: the error in the energy norm, relative to the largest row. Rounding of eigenvectors is a lower bound.
     """
 
-    warns: ClassVar[bool] = False
     tolerance: eqx.AbstractVar[float]
 
     def __check_init__(self) -> None:
@@ -227,8 +225,7 @@ def _in_parts(project: Callable[..., tuple[Array, ...]], *rows: Array) -> tuple[
 
 
 def solve_in_blocks(
-    of_group: Callable[[Int[Array, ""]], Any],  # returns the common data of a group's blocks
-    solve: Callable[..., Columns],  # (common data, rhs, wanted, *of_rows) ↦ x of one block, as columns
+    solver_of: Callable[[Int[Array, ""]], Callable[..., Columns]],  # group ↦ (rhs, wanted, *of_rows) ↦ x of one block
     size: int,  # the number of rows per block
     first: Int[np.ndarray, " groups"],  # the first row of each group of blocks
     rhs: Rows,
@@ -241,13 +238,13 @@ def solve_in_blocks(
     blocks = jnp.asarray(np.append(first // size, len(starts)))
 
     def solve_group(group: Array, x: Rows) -> Rows:
-        shared = of_group(group)
+        solve = solver_of(group)
 
         def solve_block(number: Array, x: Rows) -> Rows:
             start = jnp.asarray(starts)[number]
             b, error, *own = (jax.lax.dynamic_slice_in_dim(each, start, size) for each in (x, wanted, *of_rows))
             unsolved = start + np.arange(size) >= number * size  # the last block may overlap the previous one
-            solution = solve(shared, b.T, jnp.where(unsolved, error, jnp.inf), *own).T
+            solution = solve(b.T, jnp.where(unsolved, error, jnp.inf), *own).T
             return jax.lax.dynamic_update_slice_in_dim(x, jnp.where(unsolved[:, None], solution, b), start, axis=0)
 
         return jax.lax.fori_loop(blocks[group], blocks[group + 1], solve_block, x)

@@ -6,6 +6,8 @@ are static; by Weyl's law, the distribution of eigenvalues is regular enough. Al
 point share the factorisations.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -14,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from hks_jax.compilation import jit_quickly, known_here
+from hks_jax.compilation import is_concrete_on_cpu, jit_quickly
 from hks_jax.eigen.complement import adjoint as complement
 from hks_jax.eigen.complement.adjoint import Adjoint, Columns, OfRows, Rows, Scalar, Shifts, Values, Vectors
 from hks_jax.eigen.inertia import LocatedPencil
@@ -50,7 +52,7 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         solves: the expected number of solves per preparation. For many solves, more factorisations are computed.
 
     Examples:
-        >>> solver = hj.Dense(adjoint=hj.FactorisedAdjoint(tolerance=1e-6))
+        >>> solver = hj.ShiftInvert(adjoint=hj.FactorisedAdjoint(tolerance=1e-6))
         >>> domain = lambda s: hj.TensorField(field.grid, s * field.tensors)
         >>> scaled = lambda s: hj.hks(hj.eigenpairs(domain(s), 12, solver=solver), [0.5 * s], "volume")[0, 4, 4]
         >>> print(abs(jax.grad(scaled)(1.0)) < 1e-3)  # lengths and times grow alike
@@ -63,14 +65,13 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
     def prepare(self, pencil: SymmetricPencil, values: Values, k: int) -> Shifted:
         """Factorise K − σM for each group of the first k of p eigenvalues."""
         dissection = dissect(pencil.pattern)
-        if known_here((pencil, values)):
+        if is_concrete_on_cpu((pencil, values)):
             # Factorise the shifts in sequence by the function that the eigensolver has already compiled.
             dissection = jax.device_put(dissection)
             shifts = self._shifts(pencil, np.asarray(values), self.groups(dissection, len(values), k, values.dtype))
             each = [factorise(dissection, pencil.shifted(jnp.asarray(shift))) for shift in shifts]
-            stacked = jax.tree.map(lambda *x: np.stack(x), *((f.downward, f.upward, f.pivots) for f in each))
+            stacked = jax.tree.map(lambda *x: np.stack(x), *(factor.arrays for factor in each))
             return Factorisation(dissection, *jax.device_put(stacked)), jax.device_put(shifts)
-        # The compiled function does not return the dissection, because XLA would copy it.
         factors, shifts = self._factorise(dissection, pencil, values, k)
         return Factorisation(dissection, *factors), shifts
 
@@ -80,7 +81,7 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
     ) -> tuple[tuple[Any, ...], Shifts]:
         shifts = self._shifts(pencil, values, self.groups(dissection, len(values), k, values.dtype))
         factors = jax.lax.map(lambda shift: factorise(dissection, pencil.shifted(shift)), shifts)
-        return (factors.downward, factors.upward, factors.pivots), shifts
+        return factors.arrays, shifts
 
     @jit_quickly()
     def solve(self, prepared: Shifted, pencil: SymmetricPencil, values: Values, vectors: Vectors, rhs: Rows) -> Rows:
@@ -89,22 +90,20 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         k, tolerance = len(rhs), complement.attainable(self.tolerance, rhs.dtype)
         clean = complement.without_known(pencil, vectors)
 
-        def of_group(group: Int[Array, ""]) -> tuple[Factorisation, Array, Array]:
-            fields = jax.tree.map(lambda stacked: stacked[group], (factors.downward, factors.upward, factors.pivots))
+        def solver_of(group: Int[Array, ""]) -> Callable[..., Columns]:
+            arrays = jax.tree.map(lambda stacked: stacked[group], factors.arrays)
             near = vectors[jnp.argsort(jnp.abs(values - shifts[group]))[:WINDOW]]
-            return Factorisation(factors.dissection, *fields), near.T, pencil.mass.apply(near)
-
-        def solve_block(group: tuple[Factorisation, Array, Array], b: Array, wanted: Array, shifts: Array) -> Columns:
-            factor, near, images = group
+            columns, images = near.T, pencil.mass.apply(near)
 
             def without_near(x: Columns) -> Columns:
-                return x - matmul(near, products_with_columns(images, x))
+                return x - matmul(columns, products_with_columns(images, x))
 
-            return self._solve_block(pencil, values, without_near, clean, factor, b, wanted, shifts)
+            factor = Factorisation(factors.dissection, *arrays)
+            return partial(self._solve_block, pencil, values, without_near, clean, factor)
 
         left, wanted = complement.projected(pencil, vectors, rhs, tolerance, self._amplified(pencil, values, k))
         first, _ = self.groups(factors.dissection, len(values), k, values.dtype)
-        x = complement.solve_in_blocks(of_group, solve_block, BLOCK, first, left, wanted, values[:k])
+        x = complement.solve_in_blocks(solver_of, BLOCK, first, left, wanted, values[:k])
         clean_enough = not isinstance(self, InteriorAdjoint) and _GROWTH * jnp.finfo(rhs.dtype).eps <= tolerance
         return x if clean_enough else complement.cleaned(pencil, vectors, x)
 
@@ -130,7 +129,6 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         return complement.shifts_between(values, beyond - values[last], beyond - values[first])
 
     def _amplified(self, pencil: Any, values: Values, k: int) -> OfRows:
-
         return complement.amplification(values, k)
 
     # If r has a component along φⱼ by rounding, (K − λᵢM)(K − σM)⁻¹ multiplies it by (λⱼ − λᵢ)/(λⱼ − σ). This factor is

@@ -2,6 +2,7 @@
 
 import math
 import time
+from functools import partial
 from typing import ClassVar
 
 import equinox as eqx
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh, NamedSharding
 from jaxtyping import Array, Bool, Float
 
-from hks_jax.checks import require_count, require_number
+from hks_jax.checks import require_count
 from hks_jax.eigen.complement.adjoint import Adjoint
 from hks_jax.eigen.filter.coarsening import coarsen
 from hks_jax.eigen.filter.filtered_adjoint import FilteredAdjoint
@@ -31,6 +32,8 @@ _FIRST_ROUNDS, _COARSE_ROUNDS = 4, 2
 """The numbers of rounds on the coarsest grid, which starts from random functions, and on each intermediate grid."""
 _ROOM = 12
 """The least number of degrees of freedom per vector on a coarse grid."""
+_SPARE = 0.35
+"""The number of additional vectors as a fraction of k. More vectors need fewer but dearer rounds."""
 _LEAST_NODES = 6
 """The least number of nodes along each axis at which a grid is coarsened."""
 _LARGE = 1 << 21
@@ -51,9 +54,7 @@ class ChebyshevFilter(Eigensolver[Pencil]):
     Attributes:
         tolerance: the relative residual at which a pair counts as converged.
         block: the number of vectors filtered together. The workspace is proportional to this number.
-        spare: the number of additional vectors as a fraction of k. More vectors need fewer but dearer rounds.
         max_rounds: the maximal number of rounds on the finest grid.
-        single_precision: whether filters run in float32.
         mesh: the devices, as a `jax.sharding.Mesh` with one axis. Each device filters some of the vectors, and stores
             all vectors on a part of the grid (docs/devices.md). None is one device.
 
@@ -68,15 +69,12 @@ class ChebyshevFilter(Eigensolver[Pencil]):
     indefinite: ClassVar[bool] = False
     tolerance: float = eqx.field(default=1e-8, static=True)
     block: int = eqx.field(default=32, static=True)
-    spare: float = eqx.field(default=0.35, static=True)
     max_rounds: int = eqx.field(default=60, static=True)
-    single_precision: bool = eqx.field(default=True, static=True)
     adjoint: Adjoint = eqx.field(default=FilteredAdjoint(), static=True, kw_only=True)
     mesh: Mesh | None = eqx.field(default=None, static=True)
 
     def __check_init__(self) -> None:
         require_count("block", self.block)
-        require_number("spare", self.spare)
         require_count("max_rounds", self.max_rounds)
         if self.mesh is not None:
             checked_mesh(self.mesh)
@@ -93,7 +91,7 @@ class ChebyshevFilter(Eigensolver[Pencil]):
 
     def guards(self, k: int, n_dof: int) -> int:
         """Return half of the number of spare vectors: as guards, they keep linear solves well conditioned."""
-        return max(8, int(self.spare * k) // 2)
+        return max(8, int(_SPARE * k) // 2)
 
     def max_pairs(self, n_dof: int) -> int:
         """Return the largest k for which the filter still damps most of the spectrum."""
@@ -103,8 +101,8 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         """Return the sizes of the computation."""
         mesh = None if self.mesh is None else checked_mesh(self.mesh)
         together = self.block if mesh is None else self.block * mesh.size
-        size = math.ceil((k + max(8, self.spare * k)) / together) * together
-        return Plan(k, size, self.block, space.n_null, self.tolerance, self.single_precision, mesh)
+        size = math.ceil((k + max(8, _SPARE * k)) / together) * together
+        return Plan(k, size, self.block, space.n_null, self.tolerance, mesh)
 
 
 def _lowest(pencil: Pencil, plan: Plan, max_rounds: int, report: Report) -> Pairs:
@@ -128,35 +126,26 @@ def _lowest(pencil: Pencil, plan: Plan, max_rounds: int, report: Report) -> Pair
 _compiled = jax.jit(_lowest, static_argnames=("plan", "max_rounds", "report"))
 
 
-def _converge(
-    grid: GridFilter, rounding: Float[Array, ""], state: FilterState, max_rounds: int, report: Report
-) -> FilterState:
+def _converge(grid: GridFilter, rounding: Array, state: FilterState, max_rounds: int, report: Report) -> FilterState:
     """Return the state after the rounds on the finest grid. Report each round and, for large problems, each block."""
-    plan, told = grid.plan, report is not silent and not is_traced(state)
-    in_steps = told and plan.mesh is None and state.vectors.size >= _LARGE
-    pace = Pace(float(grid.excess(rounding, state)) if told else math.nan)
 
     def going_on(state: FilterState) -> Bool[Array, ""]:
         return (grid.unconverged(rounding, state) > 0) & (state.rounds < max_rounds)
 
-    def step(state: FilterState) -> FilterState:
-        if not told:
-            return grid.improve(rounding, state)
-        left = int(grid.unconverged(rounding, state))
-        text = f"{plan.wanted - left} of {plan.wanted} pairs, round {int(state.rounds) + 1}"
+    if report is silent or is_traced(state):
+        return while_loop(going_on, partial(grid.improve, rounding), state)
+    wanted, pace = grid.plan.wanted, Pace(float(grid.excess(rounding, state)))
+    in_steps = grid.plan.mesh is None and state.vectors.size >= _LARGE
+    while going_on(state):
+        text = f"{wanted - int(grid.unconverged(rounding, state))} of {wanted} pairs, round {int(state.rounds) + 1}"
         report(Status(text, pace.seconds_left()))
-        work = 1
 
-        def tell(done: int, of: int) -> None:
-            nonlocal work
-            work = of
+        def tell(done: int, of: int, text: str = text) -> None:
             report(Status(f"{text}, {done / of:.0%} of it filtered", pace.seconds_left(done, of)))
 
         state = grid.improve_told(rounding, state, tell) if in_steps else grid.improve(rounding, state)
-        pace.round_done(float(grid.excess(rounding, state)), work)
-        return state
-
-    return while_loop(going_on, step, state)
+        pace.round_done(float(grid.excess(rounding, state)))
+    return state
 
 
 class Pace:
@@ -169,23 +158,23 @@ class Pace:
     def __init__(self, excess: float) -> None:
         """Begin with the largest residual, as a multiple of the residual that counts as converged."""
         self._excess, self._factor = excess, math.nan
-        self._work, self._seconds = math.nan, math.nan
+        self._seconds, self._last_work, self._work = math.nan, 1, 1
         self._begin = time.perf_counter()
 
-    def round_done(self, excess: float, work: int) -> None:
-        """Record the number of products in a round, and the residual after this round."""
+    def round_done(self, excess: float) -> None:
+        """Record the residual after a round."""
         now = time.perf_counter()
         self._factor, self._excess = self._excess / excess if excess > 0 else math.inf, excess
-        self._work, self._seconds, self._begin = work, now - self._begin, now
+        self._last_work, self._seconds, self._begin = self._work, now - self._begin, now
 
-    def seconds_left(self, done: int = 0, work: int = 0) -> float | None:
+    def seconds_left(self, done: int = 0, work: int | None = None) -> float | None:
         """Return the remaining seconds after `done` of `work` products of this round; None if unknown."""
+        self._work = work or self._last_work
         if not self._factor > 1 or not self._excess > 1:
             return None
         rounds = math.ceil(math.log(self._excess) / math.log(self._factor))
         # Later rounds filter fewer pairs. So the work of this round, if known, is a better estimate than the last.
-        per_round = self._seconds * ((work or self._work) / self._work if self._work else 1.0)
-        return (rounds - (done / work if work else 0.0)) * per_round
+        return (rounds - done / self._work) * self._seconds * self._work / self._last_work
 
 
 def _nested(pencil: Pencil, plan: Plan) -> list[NodalPencil]:

@@ -36,7 +36,7 @@ class FilteredAdjoint(Adjoint[Pencil]):
         block: the number of right-hand sides solved together.
 
     Examples:
-        >>> solver = hj.Dense(adjoint=hj.FilteredAdjoint(tolerance=1e-6))
+        >>> solver = hj.ShiftInvert(adjoint=hj.FilteredAdjoint(tolerance=1e-6))
         >>> domain = lambda s: hj.TensorField(field.grid, s * field.tensors)
         >>> scaled = lambda s: hj.hks(hj.eigenpairs(domain(s), 12, solver=solver), [0.5 * s], "volume")[0, 4, 4]
         >>> print(abs(jax.grad(scaled)(1.0)) < 1e-3)  # lengths and times grow alike
@@ -69,7 +69,7 @@ class FilteredAdjoint(Adjoint[Pencil]):
         clean = complement.without_known(pencil, vectors)
         stiffness, mass_product = pencil.stiffness.of_columns(), pencil.mass.of_columns()
 
-        def one_block(_: None, b: Array, wanted: Array, shifts: Array, references: Array) -> Columns:
+        def one_block(b: Array, wanted: Array, shifts: Array, references: Array) -> Columns:
             degree = jnp.ceil(jnp.clip(band.degree_for(jnp.max(references), _GAIN), 2, _MOST_DEGREE)).astype(int)
 
             def precondition(r: Columns) -> Columns:
@@ -83,4 +83,4 @@ class FilteredAdjoint(Adjoint[Pencil]):
         k, one_group = len(rhs), np.zeros(1, int)
         left, wanted = complement.projected(pencil, vectors, rhs, tolerance, complement.amplification(values, k))
         rows = left, wanted, values[:k], quotients[:k]
-        return complement.solve_in_blocks(lambda _: None, one_block, self.block, one_group, *rows)
+        return complement.solve_in_blocks(lambda _: one_block, self.block, one_group, *rows)

@@ -49,7 +49,6 @@ class Plan(NamedTuple):
     block: int  # the number of vectors filtered together
     n_null: int  # the number of zero eigenvalues
     tolerance: float  # the relative residual at which a pair counts as converged
-    single_precision: bool  # whether filters run in float32
     mesh: Mesh | None  # the devices that share the vectors; None for one device
 
 
@@ -188,7 +187,6 @@ class GridFilter(eqx.Module):
     def filter_block(self, chosen: Filtering, values: Values, number: Number, own: Number, vectors: OwnRows) -> OwnRows:
         """Filter one block of rows; `number` is its index among all blocks, and `own` its index among these rows."""
         pencil, block, products = self.pencil, self.plan.block, self.pencil.products()
-        dtype = jnp.float32 if self.plan.single_precision else values.dtype
         band, degree = chosen.band, chosen.degrees[number]
 
         def filtered(rows: Float[Array, "b nodes"]) -> Float[Array, "b nodes"]:
@@ -200,8 +198,8 @@ class GridFilter(eqx.Module):
             inside = zeta > band.low
             image, moved = products(x)
             residual = image - jnp.where(inside, 0, theta * moved)
-            whole = jnp.where(inside, x, 0).astype(dtype)
-            z = correction(pencil, band, residual.astype(dtype), zeta, degree, whole, chosen.terms)
+            whole = jnp.where(inside, x, 0).astype(jnp.float32)
+            z = correction(pencil, band, residual.astype(jnp.float32), zeta, degree, whole, chosen.terms)
             z = jnp.where(inside, 1, jnp.clip(scale, 0, 1)) * z.astype(x.dtype)
             return rows + row_by_row(to_rows(z))
 

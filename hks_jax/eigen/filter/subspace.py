@@ -9,6 +9,7 @@ the blocks i, i + p, i + 2p, … of rows; this balances the load, because low mo
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -20,6 +21,7 @@ from hks_jax.fem.halo import Slabs
 from hks_jax.fem.nodal import NodalPencil, to_columns
 from hks_jax.linear.accelerators import row_by_row
 from hks_jax.linear.dense_eigh import pencil_eigh
+from hks_jax.linear.loops import by_column_ranges
 from hks_jax.linear.products import matmul
 
 EVERYWHERE = PartitionSpec()
@@ -80,21 +82,12 @@ def rayleigh_ritz(pencil: NodalPencil, slabs: Slabs | None, block: int, x: Rows)
         # Images stay columns. If images became rows, XLA would compute stencils in that layout, seven times slower.
         return tuple(matmul(x, image.reshape(nodes, block)) for image in images)
 
-    both = _total(slabs, jax.lax.map(among_rows, jnp.arange(m // block)))
+    both = jax.lax.map(among_rows, jnp.arange(m // block))
+    both = both if slabs is None else slabs.total(both)
     stiffness, mass = (jnp.moveaxis(p, 0, 1).reshape(m, m) for p in both)
     values, vectors = pencil_eigh((stiffness + stiffness.T) / 2, (mass + mass.T) / 2)
     values, mix = (_of_first(slabs, found) for found in (values, vectors.T))
-
-    def rotate(number: Array, x: Array) -> Array:
-        rotated = matmul(mix, jax.lax.dynamic_slice_in_dim(x, number * _CHUNK, _CHUNK, axis=1))
-        return jax.lax.dynamic_update_slice_in_dim(x, rotated, number * _CHUNK, axis=1)
-
-    whole = nodes // _CHUNK
-    if whole:
-        x = jax.lax.fori_loop(0, whole, rotate, x)
-    if nodes % _CHUNK:
-        x = x.at[:, whole * _CHUNK :].set(matmul(mix, x[:, whole * _CHUNK :]))
-    return values, x
+    return values, by_column_ranges(partial(matmul, mix), _CHUNK, x)
 
 
 def measured(pencil: NodalPencil, slabs: Slabs | None, block: int, values: Values, x: Rows) -> tuple[Values, Values]:
@@ -108,13 +101,10 @@ def measured(pencil: NodalPencil, slabs: Slabs | None, block: int, values: Value
         terms = (image - theta * moved) ** 2, moved**2, columns * image, pencil.lumped[..., None] * columns**2
         return tuple(jnp.sum(term, tuple(range(columns.ndim - 1))) for term in terms)
 
-    sums = _total(slabs, jax.lax.map(of_block, jnp.arange(values.size // block)))
+    sums = jax.lax.map(of_block, jnp.arange(values.size // block))
+    sums = sums if slabs is None else slabs.total(sums)
     residual, moved, energy, lumped = (s.ravel() for s in sums)
     return jnp.sqrt(residual / moved), energy / lumped
-
-
-def _total(slabs: Slabs | None, tree: Any) -> Any:
-    return tree if slabs is None else slabs.total(tree)
 
 
 def _of_first(slabs: Slabs | None, x: Array) -> Array:

@@ -6,7 +6,6 @@ The method is described in `hks_jax.eigen.complement.adjoint`; the preconditione
 import os
 from concurrent.futures import ThreadPoolExecutor
 from itertools import repeat
-from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -16,7 +15,6 @@ from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import SuperLU
 from threadpoolctl import threadpool_limits
 
-from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.eigen.complement import adjoint as complement
 from hks_jax.eigen.complement.adjoint import Adjoint, Rows, Values, Vectors
 from hks_jax.eigen.host.matrices import factorise_on_host, host_matrices
@@ -37,34 +35,26 @@ class HostAdjoint(Adjoint[Pencil]):
         tolerance: the error in the energy norm, relative to the largest row.
 
     Examples:
-        >>> solver = hj.Dense(adjoint=hj.HostAdjoint(tolerance=1e-6))
+        >>> solver = hj.ShiftInvert(adjoint=hj.HostAdjoint(tolerance=1e-6))
         >>> domain = lambda s: hj.TensorField(field.grid, s * field.tensors)
         >>> scaled = lambda s: hj.hks(hj.eigenpairs(domain(s), 12, solver=solver), [0.5 * s], "volume")[0, 4, 4]
         >>> print(abs(jax.grad(scaled)(1.0)) < 1e-3)  # lengths and times grow alike
         True
     """
 
-    warns: ClassVar[bool] = True
     tolerance: float = eqx.field(default=1e-12, static=True)
 
     def solve(self, prepared: None, pencil: Pencil, values: Values, vectors: Vectors, rhs: Rows) -> Rows:
-        """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`. Unconverged rows cause a warning."""
+        """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`."""
         data, matrices = host_matrices(pencil)
         tolerance = complement.attainable(self.tolerance, rhs.dtype)
 
         def on_host(data_k: ArrayLike, data_m: ArrayLike, nulls: ArrayLike, *arrays: ArrayLike) -> np.ndarray:
             values, vectors, b = (np.asarray(array, np.float64) for array in arrays)
             if not all(np.isfinite(array).all() for array in (values, vectors, b)):
-                warn_of_accuracy(
-                    f"derivative: {int(np.isnan(values).sum())} of the {values.size} required eigenpairs (including "
-                    "guards beyond k) did not converge, so the derivative is NaN. Allow more restarts or a larger basis"
-                )
                 return np.full(rhs.shape, np.nan, rhs.dtype)
             K, M = matrices(data_k, data_m, nulls)
-            x = _solve(K, M, values, vectors, b, tolerance, rhs.dtype)
-            if failed := int(np.isnan(x).any(axis=1).sum()):
-                warn_of_accuracy(complement.unsolved(failed, len(x)))
-            return x.astype(rhs.dtype)
+            return _solve(K, M, values, vectors, b, tolerance, rhs.dtype).astype(rhs.dtype)
 
         inputs = *data, values, vectors, rhs
         if not is_traced(inputs):
@@ -98,21 +88,15 @@ def _solve(
         with np.errstate(divide="ignore", invalid="ignore"):  # in finished columns
             x[block] = conjugate_gradients(product, precondition, b, wanted[block]).converged.T
 
+    if not active.size:
+        return x
+    distance = beyond - values[active]
+    number = complement.group_numbers(distance, active.size, tolerance)
     # Blocks are solved in parallel with one BLAS thread each: SuperLU's small BLAS calls gain nothing from more.
     with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(os.cpu_count()) as threads:
-        for rows, shift in _groups(values, beyond, active, tolerance):
+        for group in np.unique(number):
+            rows, own = active[number == group], distance[number == group]
+            (shift,) = complement.shifts_between(values, own.min(keepdims=True), own.max(keepdims=True))
             blocks = [rows[start : start + _BLOCK] for start in range(0, rows.size, _BLOCK)]
             list(threads.map(solve, blocks, repeat(factorise_on_host(K - shift * M))))
     return x
-
-
-def _groups(values: np.ndarray, beyond: float, active: np.ndarray, tolerance: float) -> list[tuple[np.ndarray, float]]:
-    """Divide rows into groups of neighbouring eigenvalues, each with a shift."""
-    if active.size == 0:
-        return []
-    distance = beyond - values[active]
-    number = complement.group_numbers(distance, active.size, tolerance)
-    groups = [number == i for i in np.unique(number)]
-    ends = [np.array([end(distance[group]) for group in groups]) for end in (np.min, np.max)]
-    shifts = complement.shifts_between(values, *ends)
-    return [(active[group], float(shift)) for group, shift in zip(groups, shifts, strict=True)]

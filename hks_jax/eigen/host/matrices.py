@@ -36,9 +36,7 @@ def inertia_on_host(K: csc_matrix, M: csc_matrix, shift: float) -> tuple[int, bo
     return int((factor.U.diagonal() < 0).sum()), sound
 
 
-def host_matrices(
-    pencil: SymmetricPencil,
-) -> tuple[tuple[Array, Array, Array], Callable[..., tuple[csc_matrix, csc_matrix]]]:
+def host_matrices(pencil: SymmetricPencil) -> tuple[tuple[Array, ...], Callable[..., tuple[csc_matrix, csc_matrix]]]:
     """Return the entries of K and M with the null vectors, and a function that makes SciPy matrices of them.
 
     The matrices are float64. For a null vector v, rounding errors in Kv would act as a potential. These errors are

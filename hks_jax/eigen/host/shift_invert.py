@@ -164,7 +164,6 @@ def lower_bound(pencil: Pencil) -> Float[Array, ""]:
     data, matrices = host_matrices(pencil)
     K, M = matrices(*data)
     typical = float(np.median(np.abs(K.diagonal()) / M.diagonal())) or 1.0
-    for below in 1e-3 * typical * 4.0 ** np.arange(25):
-        if inertia_on_host(K, M, -below) == (0, True):
-            return jax.device_put(np.asarray(-below, pencil.stiffness.dtype))
-    return jax.device_put(np.asarray(np.nan, pencil.stiffness.dtype))
+    shifts = -1e-3 * typical * 4.0 ** np.arange(25)
+    bound = next((shift for shift in shifts if inertia_on_host(K, M, shift) == (0, True)), np.nan)
+    return jax.device_put(np.asarray(bound, pencil.stiffness.dtype))

@@ -7,17 +7,16 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from hks_jax.checks import require_count
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.complement.adjoint import Values, Vectors
-from hks_jax.eigen.dense import Dense
-from hks_jax.eigen.inertia import LocatedPencil, dissected, lowered, translated
+from hks_jax.eigen.inertia import LocatedPencil, Number, dissected, lowered, translated
 from hks_jax.eigen.lanczos.slicing import cut, search
 from hks_jax.eigen.lanczos.slicing_state import Plan, Problem, SlicingState, Stored, first_state, unfinished
 from hks_jax.eigen.quality import measure_pairs
-from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, silent
+from hks_jax.eigen.solver import Dense, Eigensolver, RawPairs, Report, silent
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.loops import when, while_loop
@@ -62,9 +61,20 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
     def lowest(self, pencil: SymmetricPencil, k: int, report: Report = silent) -> RawPairs:
         """Return the k lowest eigenpairs; for a `LocatedPencil`, the first k above its origin."""
         plan = self.plan(k, min(pencil.n_null, k))
-        state = self.slice(expected(pencil, plan), plan, report)
-        assert state.vectors is not None
-        values, vectors, bound = _lowest(pencil, state.values, state.vectors, state.complete_below, k)
+        problem, dissection = expected(pencil, plan), dissected(pencil)
+        if not is_traced(problem):
+            problem = problem._replace(pencil=tabulated(pencil))
+
+        def step(both: tuple[SlicingState, Stored]) -> tuple[SlicingState, Stored]:
+            factor, searchable, both = cut(problem, dissection, plan, *both)
+            both = when(searchable, partial(search, problem, factor, plan), both)
+            if report is not silent and not is_traced(both):  # a report makes the host wait for its numbers
+                known, bound = min(int(both[0].known), k), float(both[0].complete_below)
+                report(f"{known} of {k} eigenpairs, all below {bound:.6g}")
+            return both
+
+        state, stored = while_loop(lambda both: unfinished(plan, both[0]), step, first_state(problem, plan))
+        values, vectors, bound = _lowest(pencil, state.values, stored, state.complete_below, k)
         if is_traced(bound) or (state.finished and not math.isnan(bound)) or pencil.size > _DENSE:
             return values, vectors, bound
         report("slicing missed pairs: computing all pairs with the dense solver")
@@ -82,22 +92,6 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
         slices = max(round(k / (self.slice_size or SLICE)), 1)
         size = math.ceil(1.06 * k / slices) + 2
         return Plan(k, self.block, size, 3 * slices + 12, self.tolerance, nulls)
-
-    def slice(self, problem: Problem, plan: Plan, report: Report = silent) -> SlicingState:
-        """Compute the wanted eigenpairs from zero upwards, slice by slice."""
-        dissection = dissected(problem.pencil)
-        if not is_traced(problem):
-            problem = problem._replace(pencil=tabulated(problem.pencil))
-
-        def step(state: SlicingState) -> SlicingState:
-            factor, searchable, state = cut(problem, dissection, plan, state)
-            state = when(searchable, partial(search, problem, factor, plan), state)
-            if report is not silent and not is_traced(state):  # a report makes the host wait for its numbers
-                known, bound = min(int(state.known), plan.wanted), float(state.complete_below)
-                report(f"{known} of {plan.wanted} eigenpairs, all below {bound:.6g}")
-            return state
-
-        return while_loop(partial(unfinished, plan), step, first_state(problem, plan))
 
 
 def known_by_weyl(pencil: SymmetricPencil) -> bool:
@@ -152,9 +146,7 @@ def first_from_origin(solver: Eigensolver, k: int, guards: int, report: Report, 
 
 
 @jax.jit
-def _from(
-    first: Int[Array, ""], existing: Int[Array, ""] | int, values: Values, vectors: Vectors
-) -> tuple[Values, Vectors]:
+def _from(first: Number, existing: Number | int, values: Values, vectors: Vectors) -> tuple[Values, Vectors]:
     """Rotate the pairs so that the first wanted pair comes first. Pairs that do not exist become zero vectors."""
     there = jnp.arange(values.size) < existing
     values, vectors = jnp.where(there, values, values[first]), jnp.where(there[:, None], vectors, 0)

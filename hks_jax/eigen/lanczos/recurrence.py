@@ -33,20 +33,14 @@ class ShiftedSolve(NamedTuple):
     passes: Int[Array, ""] | None  # 1, or 2 with a refinement step; None is 1 without compiling the refinement
 
 
-class _Blocks(NamedTuple):
-    """Two consecutive blocks of the basis, the image of the second under M, and their coupling."""
-
-    before: Block
-    block: Block
-    image: Block
-    coupling: Small
-
-
 class _Recurrence(NamedTuple):
     """The state of the recurrence."""
 
     basis: Basis  # M-orthonormal rows: the known eigenvectors, then the blocks so far; the rest is zero
-    blocks: _Blocks  # the last two blocks; the second is not yet in the basis
+    before: Block  # the last block in the basis
+    block: Block  # the following block
+    image: Block  # the image of this block under M
+    coupling: Small  # the coupling of the two blocks
     # the diagonal and subdiagonal blocks of the block tridiagonal matrix VᵀM(K − σM)⁻¹MV
     matrix: Float[Array, "steps two b b"]
 
@@ -89,7 +83,7 @@ def _begin(pencil: SymmetricPencil, start: Block, known: Known, room: int) -> _R
     block, image, _ = orthonormal(mass, block)
     basis = krylov_basis.begin(known, len(known) + room * b, b)
     none, matrix = jnp.zeros((b, b), start.dtype), jnp.zeros((room, 2, b, b), start.dtype)
-    return _Recurrence(basis, _Blocks(jnp.zeros_like(block), block, image, none), matrix)
+    return _Recurrence(basis, jnp.zeros_like(block), block, image, none, matrix)
 
 
 @jit_quickly(static_argnames=("offset", "alone"), donate_argnames="state")
@@ -105,7 +99,7 @@ def _advance(
     """Take the steps first, …, last − 1, or two steps if ``alone``. The basis has the blocks from row ``offset`` on."""
     # If an eigenvalue is close to the shift, its θ may be 1000 times as large as other θ. A step amplifies the rounding
     # error along this eigenvector by as much. So in single precision, every step projects on the whole basis.
-    every = 2 if state.blocks.block.dtype == jnp.float64 else 1
+    every = 2 if state.block.dtype == jnp.float64 else 1
     two = accelerators.at_hand()
 
     def advance(shifted: ShiftedSolve, state: _Recurrence) -> _Recurrence:
@@ -152,9 +146,9 @@ def _stepping(
 
         return jax.lax.fori_loop(0, passes, refine, (jnp.zeros_like(rhs), rhs))[0]
 
-    def step(number: Array, basis: Basis, blocks: _Blocks, now: bool | Array) -> tuple[Basis, _Blocks, Array]:
+    def step(number: Array, state: _Recurrence, now: bool | Array) -> tuple[_Recurrence, Array]:
         # Write the current block into the basis, and compute the next block.
-        before, block, image, coupling = blocks
+        basis, before, block, image, coupling, matrix = state
         b = block.shape[1]
         onward, diagonal = krylov_basis.recur(block, image, before, coupling, solve(image))
         row = offset + b * number
@@ -169,16 +163,16 @@ def _stepping(
         elif now:
             block, onward = project(block, onward)
         following, its_image, coupling = orthonormal(mass, onward)
-        blocks = _Blocks(block, following, its_image, coupling)
-        return krylov_basis.write(basis, block, row), blocks, jnp.stack([diagonal, coupling])
+        basis = krylov_basis.write(basis, block, row)
+        return _Recurrence(basis, block, following, its_image, coupling, matrix), jnp.stack([diagonal, coupling])
 
     def steps(number: Array, state: _Recurrence, projecting: tuple[bool | Array, ...]) -> _Recurrence:
-        basis, blocks, entries = state.basis, state.blocks, []
+        entries = []
         for ahead, now in enumerate(projecting):
-            basis, blocks, entry = step(number + ahead, basis, blocks, now)
+            state, entry = step(number + ahead, state, now)
             entries.append(entry)
         matrix = jax.lax.dynamic_update_slice_in_dim(state.matrix, jnp.stack(entries), number, axis=0)
-        return _Recurrence(basis, blocks, matrix)
+        return state._replace(matrix=matrix)
 
     return steps
 

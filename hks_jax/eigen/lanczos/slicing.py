@@ -7,8 +7,6 @@ last factorisation at a shift above the wanted eigenvalues: its inertia equals t
 Small slices keep orthogonalisation cheap for any number of wanted pairs.
 """
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -44,13 +42,13 @@ Order = Int[Array, " ritz"]
 
 
 def cut(
-    problem: Problem, dissection: Dissection, plan: Plan, state: SlicingState
-) -> tuple[Factorisation, Bool[Array, ""], SlicingState]:
+    problem: Problem, dissection: Dissection, plan: Plan, state: SlicingState, vectors: Stored
+) -> tuple[Factorisation, Bool[Array, ""], tuple[SlicingState, Stored]]:
     """Factorise at the state's shift; also return whether to search there, and the state with room for the results."""
     factor = factorise(dissection, problem.pencil.shifted(state.shift))
     trial = try_out(factor, problem.pencil, state.shift, state.noise)
-    searchable, full, following = _consider(problem, factor.negative, trial, plan, state._replace(vectors=None))
-    return factor, searchable, when(full, partial(make_room, plan), following._replace(vectors=state.vectors))
+    searchable, full, following = _consider(problem, factor.negative, trial, plan, state)
+    return factor, searchable, when(full, lambda both: make_room(plan, *both), (following, vectors))
 
 
 @jit_quickly(static_argnames="plan")
@@ -64,7 +62,8 @@ def _consider(
     last = jnp.sort(state.values)[plan.wanted - 1]
     all_wanted = (known >= plan.wanted) | (last * (1 - 2 * _COPY) < state.shift)  # or just below the last multiplet
     finished = complete & (all_wanted | (negative == problem.pencil.size))  # or no more exist
-    # If as many eigenvalues are missing at a nearer shift, these are equal. Then search there, repeatedly if necessary.
+    # If the same number of eigenvalues is missing at a shift closer to the known ones, the missing ones are equal. Then
+    # search at this shift, repeatedly if necessary.
     too_many = trial.sound & (missing > plan.slice_size) & (below != state.below)
     multiple = trial.sound & (missing > 2 * plan.block) & (below == state.far_below)
     # If a multiplicity exceeds the wanted number, a part suffices; the certificate is then below the multiplet.
@@ -105,46 +104,46 @@ def _needed(problem: Problem, plan: Plan, lowest: Scalar, excuse: Scalar | float
     return allowed_residuals(jnp.maximum(lowest, problem.unit), rounding, plan.tolerance)
 
 
-def search(problem: Problem, factor: Factorisation, plan: Plan, state: SlicingState) -> SlicingState:
+def search(
+    problem: Problem, factor: Factorisation, plan: Plan, both: tuple[SlicingState, Stored]
+) -> tuple[SlicingState, Stored]:
     """Find the eigenpairs around the shift."""
-    assert state.vectors is not None
+    state, vectors = both
     shifted = ShiftedSolve(factor, state.shift, state.passes)
     if not is_traced(state.multiple) and state.multiple:
-        order, vectors, following = _nearest(problem, shifted, plan, state)
+        order, new, following = _nearest(problem, shifted, plan, state, vectors)
     else:
         # If one slice suffices, usually no vector is known, and the window is empty. With several slices, an empty
         # first window would need a separate compilation.
         nothing = plan.wanted <= plan.slice_size and not is_traced(state.known) and int(state.known) == 0
-        known, interval, steps = _window(problem, plan, state, 0 if nothing else plan.window)
+        known, interval, steps = _window(problem, plan, state, vectors, 0 if nothing else plan.window)
         ritz = block_lanczos(problem.pencil, shifted, state.start, known, plan.steps, steps, plan.ritz)
-        order, following = _accept(problem, plan, ritz, interval, state._replace(vectors=None))
-        vectors = ritz[1]
+        (order, following), new = _accept(problem, plan, ritz, interval, state), ritz[1]
         if not is_traced(following.stuck) and following.stuck and state.below > 0:
-            order, vectors, following = _nearest(problem, shifted, plan, state)
+            order, new, following = _nearest(problem, shifted, plan, state, vectors)
     # A separate call, so that memory holds only the two arrays of vectors.
-    return following._replace(vectors=_stored(state.vectors, vectors, order, state.known))
+    return following, _stored(vectors, new, order, state.known)
 
 
 # Block Lanczos finds a multiple eigenvalue at most as often as a block has columns. Block Lanczos fails if the number
 # of steps exceeds that of distinct eigenvalues. Inverse iteration finds as many eigenvalues near the shift as it has
 # vectors. If a multiplicity is larger, any vectors of the eigenspace will do.
 def _nearest(
-    problem: Problem, shifted: ShiftedSolve, plan: Plan, state: SlicingState
+    problem: Problem, shifted: ShiftedSolve, plan: Plan, state: SlicingState, vectors: Stored
 ) -> tuple[Order, Float[Array, "ritz n_dof"], SlicingState]:
     """Search by inverse iteration, orthogonal to all known eigenvectors; see `_accept`. Only for concrete values."""
     missing = int(state.below - jnp.sum(state.values < state.shift))
     count = min(missing + plan.block, plan.ritz, problem.pencil.size - int(state.known))
     x = jax.random.normal(jax.random.key(int(state.slices)), (problem.pencil.size, count), state.shift.dtype)
-    assert state.vectors is not None
     worst = jnp.full((), jnp.inf)
     for turn in range(_TURNS):
-        values, x, residuals = _inverse_iteration(problem.pencil, shifted, state.vectors, state.known, x)
+        values, x, residuals = _inverse_iteration(problem.pencil, shifted, vectors, state.known, x)
         before, worst = worst, jnp.max(residuals[:missing])
         if turn > 2 and not worst < before / 2:
             break
     ritz = jnp.pad(1 / (values - state.shift), (0, plan.ritz - count)), jnp.pad(x.T, ((0, plan.ritz - count), (0, 0)))
     interval = jnp.where(problem.negative > 0, 0, -jnp.inf).astype(values.dtype), jnp.asarray(jnp.inf, values.dtype)
-    order, following = _accept(problem, plan, ritz, interval, state._replace(vectors=None))
+    order, following = _accept(problem, plan, ritz, interval, state)
     return order, ritz[1], following
 
 
@@ -166,16 +165,15 @@ def _inverse_iteration(
 
 @jit_quickly(static_argnames=("plan", "rows"))
 def _window(
-    problem: Problem, plan: Plan, state: SlicingState, rows: int
+    problem: Problem, plan: Plan, state: SlicingState, vectors: Stored, rows: int
 ) -> tuple[Float[Array, "rows n_dof"], Interval, Int[Array, ""]]:
     """Return the data of a search around the state's shift.
 
     The data are the known eigenvectors nearest to the shift, padded with zeros, to which the search stays orthogonal;
     the interval that contains no other known eigenvalue; and the number of Lanczos blocks.
     """
-    assert state.vectors is not None
     nearest = jnp.argsort(jnp.abs(state.values - state.shift))[:rows]
-    vectors = jnp.where((nearest < state.known)[:, None], state.vectors[nearest], 0)
+    vectors = jnp.where((nearest < state.known)[:, None], vectors[nearest], 0)
     others = jnp.where(jnp.isin(jnp.arange(plan.capacity), nearest), jnp.nan, state.values)
     bottom = jnp.where(problem.negative > 0, 0, -jnp.inf)
     low = jnp.fmax(jnp.nanmax(jnp.where(others < state.shift, others * (1 + 1e-6), -jnp.inf), initial=-jnp.inf), bottom)
@@ -198,7 +196,7 @@ def _accept(
 ) -> tuple[Order, SlicingState]:
     """Accept the converged Ritz pairs in the interval, and choose the next shift.
 
-    Ritz pairs outside the interval may repeat known pairs, and are not accepted. The state has no vectors.
+    Ritz pairs outside the interval may repeat known pairs, and are not accepted.
     """
     (theta, vectors), (low, high) = ritz, interval
     shift, index, dtype = state.shift, jnp.arange(plan.capacity), vectors.dtype

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.compilation import jit_quickly
+from hks_jax.linear.loops import by_column_ranges
 from hks_jax.linear.pencil import SymmetricPencil
 
 _NODES = 1 << 16
@@ -69,10 +70,9 @@ def steps_for(plan: Plan, size: int | Int[Array, ""]) -> int | Int[Array, ""]:
 
 
 class SlicingState(NamedTuple):
-    """The state between two slices. A pair is called known if it has been computed and accepted."""
+    """The state between two slices, without the vectors. A pair is called known if it was computed and accepted."""
 
     values: Float[Array, " capacity"]  # known eigenvalues in the order of acceptance, padded with infinity
-    vectors: Stored | None  # their M-orthonormal eigenvectors; None if passed as a separate argument
     known: Int[Array, ""]  # the number of known pairs
     shift: Float[Array, ""]  # the next shift
     # the number of eigenvalues from zero to the shift, by inertia; −1 if the factorisation was too inaccurate
@@ -92,13 +92,12 @@ class SlicingState(NamedTuple):
 
 
 @jit_quickly(static_argnames="plan")
-def first_state(problem: Problem, plan: Plan) -> SlicingState:
-    """Return the initial state, without known pairs."""
+def first_state(problem: Problem, plan: Plan) -> tuple[SlicingState, Stored]:
+    """Return the initial state, without known pairs, and storage for eigenvectors."""
     n, dtype = problem.pencil.size, problem.pencil.stiffness.dtype
     noise = jax.random.normal(jax.random.key(0), (n, plan.block), dtype)
-    return SlicingState(
+    state = SlicingState(
         values=jnp.full(plan.capacity, jnp.inf, dtype),
-        vectors=jnp.zeros((plan.capacity, n), dtype),
         known=jnp.zeros((), int),
         shift=problem.first,
         below=jnp.full((), -1, int),
@@ -115,6 +114,7 @@ def first_state(problem: Problem, plan: Plan) -> SlicingState:
         stuck=jnp.zeros((), bool),
         finished=jnp.zeros((), bool),
     )
+    return state, jnp.zeros((plan.capacity, n), dtype)
 
 
 @jit_quickly(static_argnames="plan")
@@ -128,32 +128,13 @@ def crowded(plan: Plan, state: SlicingState) -> Bool[Array, ""]:
     return state.stuck | (state.known > plan.capacity - plan.ritz)
 
 
-def make_room(plan: Plan, state: SlicingState) -> SlicingState:
-    """Discard the highest known pairs, which exceed the wanted number; if stuck, all pairs above ``reached``."""
-    assert state.vectors is not None
-    return _with_room(plan, state.vectors, state._replace(vectors=None))
-
-
 @jit_quickly(static_argnames="plan", donate_argnames="vectors")
-def _with_room(plan: Plan, vectors: Stored, state: SlicingState) -> SlicingState:
+def make_room(plan: Plan, state: SlicingState, vectors: Stored) -> tuple[SlicingState, Stored]:
+    """Discard the highest known pairs, which exceed the wanted number; if stuck, all pairs above ``reached``."""
     order = jnp.argsort(state.values)
     count = jnp.where(state.stuck, jnp.sum(state.values <= state.reached), state.known)
     count = jnp.minimum(count, plan.capacity - plan.ritz)
     kept = jnp.arange(plan.capacity) < count
-    return state._replace(
-        values=jnp.where(kept, state.values[order], jnp.inf), vectors=_reordered(vectors, order, kept), known=count
-    )
-
-
-def _reordered(vectors: Stored, order: Int[Array, " capacity"], kept: Bool[Array, " capacity"]) -> Stored:
-    """Permute the rows and zero those that are not kept, in place if the argument is donated."""
-
-    def some(at: int | Array, width: int, vectors: Array) -> Array:
-        part = jax.lax.dynamic_slice_in_dim(vectors, at, width, axis=1)
-        return jax.lax.dynamic_update_slice_in_dim(vectors, jnp.where(kept[:, None], part[order], 0), at, axis=1)
-
-    n = vectors.shape[1]
-    whole = n // _NODES
-    if whole:
-        vectors = jax.lax.fori_loop(0, whole, lambda number, x: some(number * _NODES, _NODES, x), vectors)
-    return some(whole * _NODES, n % _NODES, vectors) if n % _NODES else vectors
+    values = jnp.where(kept, state.values[order], jnp.inf)
+    vectors = by_column_ranges(lambda part: jnp.where(kept[:, None], part[order], 0), _NODES, vectors)
+    return state._replace(values=values, known=count), vectors

@@ -36,7 +36,7 @@ function planeOf() {
   return { axis: state.axis, across, up, index: state.index[state.axis] };
 }
 
-const REGIONS = ["none", "a lasso on an image", "all points alike"];
+const REGIONS = ["none", "a lasso on an image", "points similar to A"];
 
 function setUp() {
   element("title").textContent = about.title;

@@ -108,13 +108,13 @@ def explore(
     inside, surface, place = np.isfinite(array).all(axis=0), {}, {}
     if isinstance(grid, SurfaceMesh):
         if not (inside.all() and tensors is None and world is None):
-            raise ValueError("values, tensors, world: expected finite values, no tensors and no world for a surface")
+            raise ValueError("values, tensors, world: got NaN, tensors or world for a surface; expected finite values")
         surface = {"vertices": np.asarray(grid.vertices, "<f4"), "faces": grid.faces.astype("<i4")}
     else:
         inside &= grid.inside
         place = {"spacing": grid.spacing, "origin": grid.origin}
     if not inside.any():
-        raise ValueError("values: got no node inside the mask that is finite at all times; expected one")
+        raise ValueError("values: got no node inside the mask with finite values at all times; expected at least one")
     spread = None if lengths is None else np.asarray(lengths, dtype=np.float64)
     if spread is not None and (spread.shape != t.shape or not np.isfinite(spread).all()):
         raise ValueError(f"lengths: got shape {spread.shape}; expected {t.shape}, one finite number per time")

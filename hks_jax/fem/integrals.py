@@ -1,4 +1,4 @@
-"""Assembly of stiffness and mass on grids: the integrals over the elements are summed into stencils."""
+"""Integrals of stiffness and mass over the elements of grids and of meshes, and their sums."""
 
 from dataclasses import replace
 from functools import partial
@@ -10,18 +10,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hks_jax.checks import real_array
 from hks_jax.compilation import jit_quickly
 from hks_jax.domain import spd
-from hks_jax.domain.components import wrap_nodes
 from hks_jax.domain.grid import Grid
+from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_checks import Interpolation
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.fem.elements import MASS, Element, at_quadrature, element_matrices, moved, tensor_product_element
+from hks_jax.fem.elements import MASS, Element, element_matrices, moved, simplex_element, tensor_product_element
 from hks_jax.fem.fields import Field
 from hks_jax.fem.forms import WeakForm
 from hks_jax.fem.pencil import Pencil, assembled, gathered, row_sums_of
 from hks_jax.fem.resolution import SampledMetric
-from hks_jax.fem.space import GridSpace, couplings_for, mask_for, vector_space
+from hks_jax.fem.space import GridSpace, MeshSpace, cells_of, couplings_for, mask_for, vector_space
 from hks_jax.fem.stencil import StencilOperator
 
 _ON_HOST = 1 << 17
@@ -82,9 +83,7 @@ def _numpy_rule(args: list[Any], x: list[Any] | None, y: list[Any] | None) -> An
     h, nodes = tensor_product_element(d).values.astype(dtype), np.asarray(tensors).reshape(-1, d, d)
     corners = np.array(list(product((0, 1), repeat=d)))
     offsets = (corners[None] - corners[:, None] + 1) @ 3 ** np.arange(d)[::-1]
-    numbers = wrap_nodes(np.arange(domain.size).reshape(shape), periodic)
-    cells = [numbers[corner] for corner in product(*[(slice(None, -1), slice(1, None))] * d)]
-    cells = np.stack(cells, axis=-1)[np.asarray(elements)]
+    cells = cells_of(np.asarray(elements), shape, periodic)
     places = cells[:, :, None] + offsets * domain.size
     of_stiffness = np.einsum("q,qia,qjb->qabij", weights, gradients, gradients).reshape(-1, n * n)
     of_mass = np.einsum("q,qi,qj->qij", weights, h, h).reshape(-1, n * n)
@@ -151,11 +150,12 @@ def _grid_integrals(
     # Logarithms are computed at the nodes, and exponentials at the quadrature points. The barriers keep the compiler
     # from fusing the exponentials into each use of a component, and so from repeating them.
     nodal = tensors if interpolation == "linear" else spd.log(tensors)
-    metric = jax.vmap(lambda corners: at_quadrature(corners, element))(_at_corners(nodal, periodic))
+    at_corners = partial(_at_corners, periodic=periodic)
+    at_points = partial(Field.at_points, corners=at_corners, shape_values=element.values, elements=elements.shape)
+    metric = at_points(Field(nodal, "nodes"))
     if interpolation == "log-euclidean":
         metric = jax.lax.optimization_barrier(spd.exp(jax.lax.optimization_barrier(metric)))
-    at_corners = partial(_at_corners, periodic=periodic)
-    held = {name: field.at_points(at_corners, element.values, elements.shape) for name, field in fields.items()}
+    held = {name: at_points(field) for name, field in fields.items()}
     places = None if x is None else x.reshape(-1, *x.shape[-2:])
 
     def kept(matrices: Float[Array, "E n n"]) -> Float[Array, "E n n"]:
@@ -213,3 +213,72 @@ def _stencil(matrices: Float[Array, "*elements n n"], periodic: tuple[bool, ...]
             last = jax.lax.slice_in_dim(total, -1, None, axis=axis)
             total = inner + jnp.pad(last, [(0, n - 1 if a == axis else 0) for a, n in enumerate(inner.shape)])
     return total
+
+
+def mesh_nodes(mesh: SimplicialMesh, degree: int, midpoints: Any) -> Float[Array, "nodes 3"]:
+    """Return the positions of the nodes: the vertices and, for degree 2, the midpoints of the edges."""
+    if degree not in (1, 2):
+        raise ValueError(f"degree: got {degree!r}; expected 1 or 2")
+    vertices = mesh.vertices
+    if degree == 1:
+        if midpoints is not None:
+            raise ValueError("midpoints: got positions with degree=1, whose edges are straight; pass degree=2")
+        return vertices
+    middles = jnp.mean(vertices[mesh.triangulation.edges], axis=1)
+    if midpoints is None:
+        return jnp.concatenate([vertices, middles])
+    if mesh._metric is not None:
+        raise ValueError("midpoints: got positions for a mesh with a given metric; leave out midpoints or metric")
+    moved = midpoints
+    if callable(midpoints):
+        on_surface = mesh.triangulation.boundary_edges | (mesh.triangulation.dimension == 2)
+        moved = middles.at[on_surface].set(jax.vmap(midpoints)(middles[on_surface]))
+    moved = real_array("midpoints", moved)
+    if moved.shape != middles.shape:
+        raise ValueError(
+            f"midpoints: got shape {moved.shape}; expected {middles.shape}, a position for each of "
+            "mesh.triangulation.edges, or a function of one position"
+        )
+    return jnp.concatenate([vertices, moved.astype(vertices.dtype)])
+
+
+def mesh_points(nodes: Float[Array, "nodes 3"], space: MeshSpace) -> Float[Array, "n q 3"]:
+    """Return the positions of the quadrature points in each cell."""
+    values = jnp.asarray(simplex_element(space.dimension, space.degree).values, nodes.dtype)
+    return jnp.einsum("qi,nix->nqx", values, nodes[space.cells], precision="highest")
+
+
+@jit_quickly(static_argnames=("space", "operator", "curved"))
+def assemble_mesh(
+    mesh: SimplicialMesh,
+    nodes: Float[Array, "nodes 3"],
+    curved: bool,
+    fields: dict[str, Field],
+    space: MeshSpace,
+    operator: WeakForm,
+) -> Pencil:
+    """Return the pencil of a mesh; if it is ``curved``, its edges pass through their midpoints."""
+    element = simplex_element(space.dimension, space.degree)
+    shape = len(space.cells), element.weights.size
+    if curved:
+        slopes = jnp.asarray(element.gradients, nodes.dtype)
+        frames = mesh._oriented(jnp.einsum("qia,nix->nqxa", slopes, nodes[space.cells], precision="highest"))
+        metric = spd.positive_or_nan(jnp.einsum("nqxa,nqxb->nqab", frames, frames, precision="highest"))
+    else:
+        metric, frames = (jnp.broadcast_to(x[:, None], (*shape, *x.shape[1:])) for x in (mesh.metric, mesh._edges))
+    held = {
+        name: field.at_points(lambda x: x[space.cells], element.values, shape[:1]) for name, field in fields.items()
+    }
+    x, seen = (mesh_points(nodes, space), frames) if operator.own else (None, None)
+
+    integrals = jax.vmap(partial(element_matrices, element=element, form=operator))
+    stiffness, mass = integrals(metric, x=x, fields=held, frames=seen)
+    own = space if operator.components == 1 else vector_space(space, operator.components)
+    lumped = volumes = row_sums_of(own, mass)
+    if "density" in fields:
+        volumes = jnp.sqrt(spd.determinant(metric)) @ element.weights.astype(metric.dtype)
+    # The error of P1 elements is estimated from the lengths of edges. No such estimate is known for P2.
+    sampled = SampledMetric(jax.lax.stop_gradient(mesh.metric), None) if space.degree == 1 else None
+    return assembled(
+        gathered(own, stiffness), gathered(own, mass), lumped, sampled, jnp.sum(volumes), own, operator, fields
+    )
