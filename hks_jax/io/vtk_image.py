@@ -211,8 +211,8 @@ def _tensor_array(name: str, image: Mapping[str, np.ndarray], wanted: str | None
     listed = ", ".join(f"{key!r} ({n[0] if n else 1})" for key, n in had.items()) or "none"
     asked = "" if wanted is None else f" named {wanted!r}"
     raise ValueError(
-        f"{name}: got the arrays (components) {listed}; expected one array of 6 or 9 components{asked}. Pass array, the "
-        "name of the one to read"
+        f"{name}: got the arrays (components) {listed}; expected one array of 6 or 9 components{asked}. Pass "
+        "array, the name of the one to read"
     )
 
 
