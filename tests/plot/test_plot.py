@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from hks_jax import Grid, SurfaceMesh, TensorField
 from hks_jax.domain.examples import ball_mesh
+from hks_jax.io import Result, TensorVolume
 from hks_jax.plot import (
     ellipses,
     evenly_spaced_lines,
@@ -20,6 +22,7 @@ from hks_jax.plot import (
     save_figure,
     scalar_image,
     sensitivity,
+    signature_panels,
     surface,
     trace,
 )
@@ -468,3 +471,18 @@ def test_pictures_are_cropped_and_coloured_away_from_the_rim():
     deep = away_from_rim(solid)
     assert deep.sum() > solid.sum() / 3
     assert not deep[..., 1].any()
+
+
+@pytest.mark.parametrize(
+    ("normalisation", "title"),
+    [("raw", "HKS in units of $t^{-1}$"), ("flat", r"$4\pi t$·HKS, which is 1 for flat space")],
+)
+def test_pictures_of_a_signature_name_it_and_the_distance_of_diffusion(normalisation, title):
+    place = TensorVolume(np.broadcast_to(2 * np.eye(2), (6, 5, 2, 2)), (1.0, 1.0), (0.0, 0.0))
+    place = replace(place, length_unit="mm", unit="mm²/s")
+    report = {"settings": {"metric": "inverse", "normalisation": normalisation}}
+    values = np.stack([np.linspace(0.9, 1.1, 30).reshape(6, 5)] * 2)
+    figure = signature_panels(Result(place, values, np.array([2.0, 8.0]), report=report))
+    assert figure.get_suptitle() == f"{title}, metric D⁻¹"
+    titles = [ax.get_title() for ax in figure.axes]
+    assert titles == ["$t$ = 2 s\n$\\sqrt{Dt}$ = 2 mm", "$t$ = 8 s\n$\\sqrt{Dt}$ = 4 mm"]
