@@ -64,7 +64,8 @@ class Coherence(NamedTuple):
         worse = [f"along the {a.name} axes" for a in self.worse if a.is_frame]
         if flips := [a.name for a in self.worse if not a.is_frame]:
             worse.append(f"with {', '.join(flips)} reversed")
-        return f"{_SAID} {self.angle:.1f}° on average, and clearly more {', or '.join(worse)}" if worse else ""
+        said = f"The axes of the tensors seem right. {_SAID} {self.angle:.1f}° on average, and clearly more"
+        return f"{said} {', or '.join(worse)}" if worse else ""
 
     def question(self, option: str) -> str:
         """Return a question whether the argument `option` is wrong, or the empty text if no other axes are better."""

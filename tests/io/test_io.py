@@ -584,6 +584,7 @@ def test_results_come_back_as_they_were_saved(tmp_path, rng, times):
     assert recorded_boundary(read.settings) == settings["boundary"]
     assert read.unit == "s"
     if times.size:
+        assert repr(read) == f"Result(hks: float64 (2, 6, 5), 2 times 1 … 2.5 s, source='{tmp_path / 'hks.npz'}')"
         np.testing.assert_allclose(read.z, (values - 1) / (0.1 + values))
     else:
         assert read.z is None
