@@ -37,8 +37,8 @@ COLOURED = 0.98
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
-    from hks_jax.plot import new_figure, save_figure, scalar_image
-    from hks_jax.plot.signature import cropped, placed, proportion
+    from hks_jax.plot import hks_panels
+    from hks_jax.plot.signature import cropped, placed
 
     volume, settings, periodic = read_volume(args, progress), Settings.of(args), args.periodic or ""
     if volume.dimension != 2:
@@ -72,15 +72,11 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     volume = volume.with_mask(field.grid.mask)
     stale = [args.output / f"curvature{suffix}" for suffix in WRITTEN]
     with writing(args.output, report, progress, lambda: stale) as (folder, done):
-        result = Result(volume, curvature[None], np.zeros(0), np.zeros(0), report, name="curvature")
+        result = Result(volume, curvature[None], np.zeros(0), report=report, name="curvature")
         result.save(folder / "curvature", image_suffix(args.file))
         grid, box = cropped(volume, known)
         limit = float(np.quantile(np.abs(values), COLOURED)) or 1.0
-        orientation = placed(volume, box, args.view)
-        figure = new_figure(4.8, 3.6 * proportion(grid, orientation) + 0.6)
-        ax, label = figure.subplots(), "in 1/length² of the metric"
-        colours: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit, "label": label}
-        scalar_image(ax, curvature[box], grid, orientation=orientation, **colours)
-        ax.set_title("Gaussian curvature", fontsize="medium")
-        save_figure(figure, folder / "curvature.png")
+        style: dict[str, Any] = {"cmap": "RdBu_r", "limits": [(-limit, limit)], "label": "in 1/length² of the metric"}
+        style |= {"orientation": placed(volume, box, args.view), "path": folder / "curvature.png"}
+        hks_panels(curvature[None, *box], [0.0], grid, titles=["Gaussian curvature"], **style)
     return done

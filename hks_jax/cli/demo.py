@@ -11,6 +11,7 @@ examples:
 
 import argparse
 import importlib.util
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -22,7 +23,8 @@ from hks_jax.cli.outputs import Done, write_outputs
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.values import Times
 from hks_jax.domain import examples
-from hks_jax.io import ExampleBrain, TensorVolume, erode, find_example_brain, fit_dwi
+from hks_jax.io import TensorVolume, erode, find_example_brain, fit_dwi
+from hks_jax.io.units import MM2_PER_S, median_mean_diffusivity
 
 OPTIONS = """
 -o,--output OUT = demo  folder for the results
@@ -43,41 +45,30 @@ PHANTOM_SHAPE = (72, 80)
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
-    from hks_jax.plot import number_text, signature_panels
+    from hks_jax.plot import signature_panels
 
-    brain = None if args.phantom else _installed_brain(progress)
+    brain = None if args.phantom else find_example_brain()
+    if not args.phantom and (brain is None or importlib.util.find_spec("dipy") is None):
+        progress.note('using a phantom, because the brain needs the wheel mdt==1.2.7 and pip install "hks-jax[dti]"')
+        brain = None
     if brain is None:
         tensors, mask, spacing = map(np.asarray, examples.phantom(PHANTOM_SHAPE))
         h = tuple(np.broadcast_to(spacing, (2,)).astype(float).tolist())
         volume = TensorVolume(tensors, h, (0.0, 0.0), mask.astype(bool), source="phantom")
+        volume = replace(volume, length_unit="mm", unit=MM2_PER_S)
     else:
         with progress.stage("tensor fit", f"{brain.images.name}, b ≤ {B_MAX:g} s/mm²"):
             volume = fit_dwi(brain.images, brain.bval, brain.bvec, brain.mask, b_max=B_MAX).slice("z", 0)
             volume = volume.with_mask(erode(volume.inside, RIM))
-    mean = np.trace(volume.tensors, axis1=-2, axis2=-1) / 2
-    lengths = min(volume.spacing) * SPREADS
-    times = lengths**2 / np.median(mean[volume.mask])
+    times = (min(volume.spacing) * SPREADS) ** 2 / median_mean_diffusivity(volume)
     chosen: dict[str, Any] = {"metric": "inverse", "components": "largest", "k": N_PAIRS, "normalisation": "flat"}
     settings = Settings.of(**chosen, times=Times(tuple(times.tolist()), 0))
     result = signature_of(args, compute_pairs(volume, settings, progress), progress)
-    spread = (rf"($\sqrt{{Dt}}$ ≈ {length:.2g} mm)" for length in lengths)
-    titles = [f"$t$ = {number_text(t)} s  {text}" for t, text in zip(times, spread, strict=True)]
     title = (
         rf"$4\pi t\,$HKS of {'a phantom' if brain is None else 'a brain slice'}, metric D⁻¹. The value 1 means flat; "
         "larger values mean positive curvature of the metric or the boundary"
     )
-    first = "mean diffusivity, mm²/s", mean
-    drawing = partial(signature_panels, result, titles=titles, first=first, title=title, view=args.view)
+    drawing = partial(signature_panels, result, title=title, view=args.view)
     done = write_outputs(args.output, result, progress, drawing, "" if brain is None else ".nii.gz")
     picture = next(file for file in done.files if file.suffix == ".png")
     return done._replace(text=f"The picture is {picture}")
-
-
-def _installed_brain(progress: Progress) -> ExampleBrain | None:
-    brain = find_example_brain()
-    if brain is None:
-        progress.note("the example brain (wheel mdt==1.2.7) is not installed; using the phantom")
-    elif importlib.util.find_spec("dipy") is None:
-        progress.note('DIPY, which fits tensors, is not installed (pip install "hks-jax[dti]"); using the phantom')
-        brain = None
-    return brain

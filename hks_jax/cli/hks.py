@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from hks_jax import SurfaceMesh, TensorNoise, TetMesh, assemble
 from hks_jax.cli import pairs as saved_pairs
@@ -40,7 +40,7 @@ from hks_jax.cli.outputs import PAIRS, Done, of_earlier, write_outputs
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import image_suffix, read, read_volume, require_metric
 from hks_jax.fem.assembly import MESH_BOUNDARIES
-from hks_jax.io import TensorVolume, read_mask, read_mesh, read_mesh_arrays, sample_tensors
+from hks_jax.io import read_mask, read_mesh, read_mesh_arrays, sample_tensors
 from hks_jax.io.mesh import WRITTEN, is_mesh
 from hks_jax.io.repair import require_valid
 from hks_jax.io.result import Result
@@ -49,7 +49,9 @@ from hks_jax.optional import optional
 
 OPTIONS = f"""
 @file @metric {READING} @output {SOLVING}
---through I,J,K  voxel through which the slices in the picture of a volume pass (default: a voxel in the middle)
+--through I,J,K
+    voxel through which the slices in the picture of a volume pass, or else the nearest voxel in the domain (default: a
+    voxel in the middle)
 @clean
 --tensors FILE
     tensors of a volume that contains the mesh (a cortical surface, for example). The tensors are interpolated at the
@@ -71,28 +73,26 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
     if is_mesh(args.file):
         return _on_mesh(args, Settings.of(args, metric=args.metric), progress)
-    refuse(args, ("clean",), "this option is for meshes; for tensors on a grid, see --repair")
-    refuse(args, ("inside",), "this option is for meshes; for tensors on a grid, see --mask")
+    refuse(args, ("clean", "inside"), "this option is for meshes; for tensors on a grid, see --repair and --mask")
     refuse(args, ("tensors",), "this option is for a mesh inside a volume; leave it out for the volume itself")
-    return _on_grid(args, Settings.of(args), progress)
-
-
-def _on_grid(args: argparse.Namespace, settings: Settings, progress: Progress) -> Done:
     require_spectral(args)
-    if saved := saved_pairs.is_saved_pairs(args.file):
+    if saved := not args.others and saved_pairs.is_saved_pairs(args.file):
         refuse(args, ("noise",), _NO_NOISE)
-        saved_pairs.check_options(args)
+        settled = [option.name for option in options_in(f"@metric {READING} {SOLVING}")]
+        why = f"the eigenpairs in {args.file} determine this setting; leave the option out"
+        refuse(args, (*settled, "save_pairs"), why)
     else:
         require_metric(args)
     from hks_jax.plot import signature_panels
 
+    settings = Settings.of(args)
     if saved:
         solved, image = saved_pairs.read_pairs(args.file, settings, progress)
         volume = solved.volume
     else:
         volume, image = read_volume(args, progress), image_suffix(args.file)
-    if args.through is not None:
-        _check_voxel(args.through, volume)
+    if volume.dimension == 2:
+        refuse(args, ("through",), "this option is for a volume; leave it out for a slice")
     if not saved:
         solved = compute_pairs(volume, settings, progress)
     if args.save_pairs:  # at once, because later steps may fail
@@ -104,18 +104,6 @@ def _on_grid(args: argparse.Namespace, settings: Settings, progress: Progress) -
     drawing = partial(signature_panels, result, view=args.view, through=args.through)
     done = write_outputs(args.output, result, progress, drawing, image)
     return done._replace(files=[*done.files, *[args.output / PAIRS] * args.save_pairs])
-
-
-def _check_voxel(voxel: tuple[int, int, int], volume: TensorVolume) -> None:
-    """Raise ValueError, before the long computation, if no slices can be drawn through a voxel."""
-    text = ",".join(map(str, voxel))
-    if volume.dimension != 3:
-        raise ValueError(f"--through: got {text} for a slice; expected a volume. Leave this option out")
-    if not all(i < n for i, n in zip(voxel, volume.shape, strict=True)):
-        raise ValueError(f"--through: got {text}; expected a voxel of the volume with shape {volume.shape}")
-    if not volume.inside[voxel]:
-        middle = ",".join(map(str, np.argwhere(volume.inside)[volume.inside.sum() // 2]))
-        raise ValueError(f"--through: got {text}, which is outside the mask; expected a voxel inside, such as {middle}")
 
 
 def _on_mesh(args: argparse.Namespace, settings: Settings, progress: Progress) -> Done:
@@ -197,18 +185,16 @@ def _read_domain(args: argparse.Namespace, progress: Progress) -> tuple[SurfaceM
         n = values.shape[1]
         raise ValueError(f"--array: got {args.array!r} with {n} components; expected 9, or 6 with --order")
     tensors = matrices(args.array, values, args.order).tensors.astype(args.dtype)
-    return domain(tensors), None if args.noise is None else Noisy(tensors, _relative(args.noise, tensors), domain)
-
-
-def _relative(noise: str, tensors: Float[np.ndarray, "V 3 3"]) -> TensorNoise:
+    if args.noise is None:
+        return domain(tensors), None
     try:
-        level = float(noise)
+        level = float(args.noise)
     except ValueError:
         raise ValueError(
-            f"--noise: got {noise!r}; expected a number, relative to the mean diffusivity, for tensors at the "
+            f"--noise: got {args.noise!r}; expected a number, relative to the mean diffusivity, for tensors at the "
             "vertices of a mesh"
         ) from None
-    return TensorNoise.relative(tensors, level)
+    return domain(tensors), Noisy(tensors, TensorNoise.relative(tensors, level), domain)
 
 
 def _inside(path: Path, n_vertices: int) -> Bool[np.ndarray, " V"]:
@@ -223,15 +209,18 @@ def _inside(path: Path, n_vertices: int) -> Bool[np.ndarray, " V"]:
 def _draw_mesh(result: Result, path: Path) -> None:
     """Draw the signature on the surface, or on the boundary of a solid, with a separate colour scale for each time."""
     from hks_jax.plot import new_figure, number_text, save_figure, surface
+    from hks_jax.plot.images import colours_of
+    from hks_jax.plot.signature import LEAST_RANGE, caption
 
-    mesh, n = result.place, len(result.times)
+    mesh = result.place
     assert isinstance(mesh, SurfaceMesh | TetMesh)
-    columns = min(n, 4)
-    rows = math.ceil(n / columns)
-    figure = new_figure(3.4 * columns, 3.0 * rows)
+    columns = min(len(result.times), 4)
+    rows = math.ceil(len(result.times) / columns)
+    figure = new_figure(3.4 * columns, 3.0 * rows + 0.3)
+    figure.suptitle(caption(result))
     for i, (time, values) in enumerate(zip(result.times, result.values, strict=True)):
         ax = figure.add_subplot(rows, columns, i + 1, projection="3d")
-        mappable = surface(ax, mesh, values)
-        ax.set_title(f"t = {number_text(float(time))}", fontsize="medium")
-        figure.colorbar(mappable, ax=ax, shrink=0.6)
+        ((low, high, _),) = colours_of([values], least_range=LEAST_RANGE)
+        figure.colorbar(surface(ax, mesh, values, vmin=low, vmax=high), ax=ax, shrink=0.6)
+        ax.set_title(f"$t$ = {number_text(float(time))}", fontsize="medium")
     save_figure(figure, path)

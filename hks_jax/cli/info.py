@@ -4,6 +4,7 @@ Describe a file of tensors: the shape, the order of the components and its sourc
 its connected components, the eigenvalues, the number of tensors that are not positive definite, and suitable k and t.
 The command also asks questions if the frame or a unit looks wrong. For a mesh of triangles or tetrahedra
 ({meshes}, or a FreeSurfer surface), it gives the size, the boundary, the connected components, and suitable k and t.
+For a result of another command, it gives the times and settings, and the commands that draw the result.
 
 examples:
   hks-jax info tensor.nii.gz --mask mask.nii.gz
@@ -20,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from hks_jax.cli.options import READING, as_options
+from hks_jax.cli.pairs import arrays_in
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read
 from hks_jax.domain.components import label_nodes
@@ -30,6 +32,7 @@ from hks_jax.fem.boundary import BoundarySpec, default_boundary
 from hks_jax.io import TensorVolume, find_invalid, read_mesh
 from hks_jax.io.mesh import is_mesh
 from hks_jax.io.repair import find_unsymmetric
+from hks_jax.io.result import NAMES, Result, signature_file
 from hks_jax.io.units import MM2_PER_S, by_axis, is_plausible
 from hks_jax.io.volume import digest
 from hks_jax.signatures.times import suitable, suitable_times
@@ -40,11 +43,36 @@ OPTIONS = f"@file {READING} @clean"
 def run(args: argparse.Namespace, progress: Progress) -> None:
     """Run the command."""
     progress.quiet, questions = True, list[str]()
-    if is_mesh(args.file):
+    if (result := _result_of(args.file)) is not None:
+        description = _describe_result(result)
+    elif is_mesh(args.file):
         description = {"file": str(args.file), **describe_mesh(args.file, read_mesh(args.file, clean=args.clean))}
     else:
         description = {**describe(args.file, read(args, progress, questions.append)), "questions": questions}
     print(json.dumps(description, indent=2, ensure_ascii=False) if args.json else "\n".join(_lines(description)))
+
+
+def _result_of(path: Path) -> Result | None:
+    """Return the result in a file or a folder, or beside its image; None for other files."""
+    file = signature_file(path) if path.is_dir() else Path(str(path).removesuffix(".gz")).with_suffix(".npz")
+    return Result.read(file) if arrays_in(file).intersection(NAMES) else None
+
+
+def _describe_result(result: Result) -> dict[str, Any]:
+    facts = {
+        "file": result.source,
+        "result": {"hks": "heat kernel signature", "curvature": "Gaussian curvature"}[result.name],
+        "shape": result.values.shape[1:],
+        "inside": int(np.isfinite(result.values[0]).sum()),
+        **{name: value for name, value in result.settings.items() if value},
+        "times": result.times.tolist(),
+        "√(Dt)": [] if result.lengths is None else result.lengths.tolist(),
+        "to draw it": f"hks-jax plot {result.source} -o picture.png",
+    }
+    if result.name == "hks":
+        facts["to explore it"] = f"hks-jax explore {result.source}"
+        facts["for regions"] = f"hks-jax stats {result.source} --atlas LABELS"
+    return facts
 
 
 def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = None) -> dict[str, Any]:
@@ -106,17 +134,20 @@ def describe_mesh(path: Path, mesh: SimplicialMesh) -> dict[str, Any]:
     }
 
 
+def _plain(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_plain, value))
+    return f"{value:.5g}" if isinstance(value, float) else str(value)
+
+
 def _lines(description: dict[str, Any]) -> list[str]:
+    if "sha256" not in description:  # of a result
+        return [f"{name:<16}{_plain(value)}" for name, value in description.items() if value]
     lines = [f"{description['file']}: {description['format']}, SHA-256 {description['sha256'][:16]}…"]
-    words = next((words for words in WORDS.values() if words.simplices in description), None)
-    if words is not None:
-        lines += [
-            f"mesh            {description['vertices']} vertices, {description[words.simplices]} {words.simplices}",
-            f"boundary        {description['boundary_vertices']} vertices",
-            f"components      {description['components']}",
-            f"{words.measure:<16}{description[words.measure]:.5g}",
-            f"median edge     {description['median_edge']:.5g}",
-        ]
+    if "vertices" in description:
+        left_out = ("file", "format", "sha256", "suits")
+        facts = {name.replace("_", " "): value for name, value in description.items() if name not in left_out}
+        lines += [f"{name:<18}{_plain(value)}" for name, value in facts.items()]
     else:
         bad, sizes = description["not_positive_definite"], ", ".join(map(str, description["component_sizes"]))
         length = f" {description['length_unit']}" if description["length_unit"] else ", without a declared unit"
@@ -145,13 +176,17 @@ def _lines(description: dict[str, Any]) -> list[str]:
             lines[-1] += ": see --repair"
         if description["not_symmetric"]:
             lines.append(f"                {description['not_symmetric']} tensors are not symmetric")
-    unit, time = _units(description)
+    in_mm, unit = description.get("length_unit") == "mm", description.get("unit", "")
+    if in_mm and not unit:
+        known = is_plausible(description.get("median_mean_diffusivity", 0.0))
+        unit = f"{MM2_PER_S} (not declared)" if known else "(unit not declared)"
+    time = " s" if in_mm and unit.startswith(MM2_PER_S) else ""
     if "eigenvalues" in description:
         e = description["eigenvalues"]
         lines += [
-            f"eigenvalues     {e['least']:.3g} … {e['largest']:.3g}, median {e['median']:.3g}{unit}",
-            f"diffusivity     {description['median_mean_diffusivity']:.3g}{unit}, the median of the tensors' mean "
-            "eigenvalues",
+            f"eigenvalues     {e['least']:.3g} … {e['largest']:.3g}, median {e['median']:.3g} {unit}".rstrip(),
+            f"diffusivity     {description['median_mean_diffusivity']:.3g} {unit}".rstrip()
+            + ", the median of the tensors' mean eigenvalues",
         ]
     lines += [f"question        {question}" for question in description.get("questions", ())]
     for name, s in description.get("suits", {}).items():
@@ -163,13 +198,3 @@ def _lines(description: dict[str, Any]) -> list[str]:
             f"t ≥ {s['least_time_of_k']:.3g}{of} for k = {s['k']}; t ≤ {s['largest_time']:.3g}{of} from the size"
         )
     return lines
-
-
-def _units(description: dict[str, Any]) -> tuple[str, str]:
-    """Return the units of diffusivities and of times in the metric D⁻¹ as texts, empty if they are unknown."""
-    if description.get("unit"):
-        return f" {description['unit']}", " s" if description["length_unit"] == "mm" else ""
-    if description.get("length_unit") != "mm":
-        return "", ""
-    median = description.get("median_mean_diffusivity", 0.0)
-    return (f" {MM2_PER_S} (not declared)", " s") if is_plausible(median) else (" (unit not declared)", "")

@@ -1,6 +1,7 @@
 """Compute the heat kernel signature of a tensor volume or a mesh, and the facts for the report."""
 
 import argparse
+import math
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Literal, NamedTuple
 
@@ -20,7 +21,7 @@ from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result
 from hks_jax.io.units import median_mean_diffusivity
 from hks_jax.signatures.hks import HKSMethod, Normalisation
-from hks_jax.signatures.times import SHOWN, default_k
+from hks_jax.signatures.times import LAST, default_k
 
 
 class ComputationError(RuntimeError):
@@ -94,8 +95,8 @@ def result_of(
 
 
 def automatic_times(pairs: hj.Eigenpairs, n: int) -> tuple[float, ...]:
-    """Return n default times; at the last, the non-constant modes have decayed to the factor `SHOWN`."""
-    return tuple(np.asarray(hj.default_times(pairs, n, SHOWN), np.float64).tolist())
+    """Return n default times; at the last, √t is about half the length of the domain."""
+    return tuple(np.asarray(hj.default_times(pairs, n, math.exp(-LAST)), np.float64).tolist())
 
 
 def field_of(volume: TensorVolume, grid: hj.Grid, settings: Settings) -> hj.TensorField:

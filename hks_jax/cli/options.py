@@ -88,8 +88,8 @@ file FILE...
 --solver SOLVER = auto  eigensolver
 [signature] the signature
 --times T...
-    positive numbers, in s for --metric inverse; or auto, or auto:N for N times that suit the eigenvalues (default
-    auto:6). 'hks-jax info FILE' shows suitable times
+    positive numbers, in s for --metric inverse; or auto, or auto:N for N times that suit the eigenvalues, the last when
+    √t is half the length of the domain (default auto:6). 'hks-jax info FILE' shows suitable times
 --normalisation raw|heat-trace|volume|flat = raw  normalisation of the signature
 --method spectral|spectrum-free|auto = spectral
     method: a sum over eigenpairs (default), a computation without eigenpairs, or a choice by t, k and the spacing. For
@@ -280,5 +280,5 @@ def add_command(subparsers: Any, command: ModuleType) -> argparse.ArgumentParser
     # A word that begins with a minus and a digit is a point, such as -20,35, and not an option.
     parser._negative_number_matcher = re.compile(r"-[\d.]")
     add_options(parser, f"{command.OPTIONS}\n@common")
-    parser.set_defaults(run=command.run, prog=parser.prog)
+    parser.set_defaults(run=command.run, prog=parser.prog, **getattr(command, "DEFAULTS", {}))
     return parser

@@ -1,6 +1,5 @@
 """Write and read eigenpairs together with their field, for ``hks-jax hks --save-pairs`` and ``hks-jax hks PAIRS``."""
 
-import argparse
 import json
 import zipfile
 from collections.abc import Sequence
@@ -12,7 +11,6 @@ import numpy as np
 
 from hks_jax import assemble
 from hks_jax.cli.job import Settings, Solved, field_of
-from hks_jax.cli.options import READING, SOLVING, options_in, refuse
 from hks_jax.cli.progress import Progress
 from hks_jax.io.arrays import place_of, volume_of
 from hks_jax.io.pairs import pairs_of, save_pairs
@@ -26,21 +24,17 @@ _ABOUT = ("order", "frame", "source", "digest", "slice_axis", "length_unit", "un
 """The attributes of a volume that are saved as text."""
 
 
+def arrays_in(path: Path) -> set[str]:
+    """Return the names of the arrays in an npz; the empty set for other files."""
+    if path.suffix.lower() != ".npz" or not zipfile.is_zipfile(path):
+        return set()
+    with zipfile.ZipFile(path) as archive:
+        return {name.removesuffix(".npy") for name in archive.namelist()}
+
+
 def is_saved_pairs(path: Path) -> bool:
     """Return whether a file contains eigenpairs with their field."""
-    if path.suffix.lower() != ".npz" or not zipfile.is_zipfile(path):
-        return False
-    with zipfile.ZipFile(path) as archive:
-        return f"{_RECORD}.npy" in archive.namelist()
-
-
-def check_options(args: argparse.Namespace) -> None:
-    """Raise ValueError for options that the saved eigenpairs determine."""
-    if args.others:
-        raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one file of eigenpairs")
-    settled = [option.name for option in options_in(f"@metric {READING} {SOLVING}")]
-    why = f"the eigenpairs in {args.file} determine this setting; leave the option out"
-    refuse(args, (*settled, "save_pairs"), why)
+    return _RECORD in arrays_in(path)
 
 
 def write_pairs(path: Path, solved: Solved, image: str, warnings: Sequence[str], fingerprint: str = "") -> None:

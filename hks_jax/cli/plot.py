@@ -57,22 +57,23 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     if args.output.suffix.lstrip(".").lower() not in formats:
         raise ValueError(f"--output: got {args.output}; expected a name that ends in one of {', '.join(formats)}")
     result = Result.read(args.result, args.array)
+    if args.scaled and not (result.times.size and result.normalisation in ("raw", "flat")):
+        raise ValueError(
+            f"--scaled: got {args.result} with the normalisation {result.normalisation}; expected raw or flat, and "
+            "times. Leave this option out"
+        )
     chosen = _choose_times(result, args)
     result = replace(result, values=result.values[chosen], times=result.times[chosen[: result.times.size]])
-    normalisation = result.settings.get("normalisation", "raw")
-    if args.scaled:
-        if not result.times.size or normalisation not in ("raw", "flat"):
-            raise ValueError(
-                f"--scaled: got {args.result} with the normalisation {normalisation}; expected raw or flat, and "
-                "times. Leave this option out"
-            )
-        if normalisation == "raw":
-            result = replace(result, values=result.values * result.flat_scale)
-    args.scaled = args.scaled or normalisation == "flat"
-    figure = _panels(result, args) if args.points is None else _curves(result, args)
+    flat = result.normalisation == "flat"
+    values = result.values * result.flat_scale if args.scaled and not flat else result.values
+    if args.points is None:
+        figure = _panels(replace(result, values=values), args)
+    else:  # hks_curves multiplies by the scale itself
+        raw = result.values / result.flat_scale if flat else result.values
+        figure = _curves(replace(result, values=raw), args, args.scaled or flat)
     save_figure(figure, args.output, dpi=args.dpi)
-    values = {"least": float(np.nanmin(result.values)), "greatest": float(np.nanmax(result.values))}
-    summary = {"source": str(args.result), "times": result.times.tolist(), "values": values}
+    ends = {"least": float(np.nanmin(values)), "greatest": float(np.nanmax(values))}
+    summary = {"source": str(args.result), "times": result.times.tolist(), "values": ends}
     return Done([args.output], summary)
 
 
@@ -82,19 +83,16 @@ def _choose_times(result: Result, args: argparse.Namespace) -> np.ndarray:
     if not times.size:
         refuse(args, ("times", "points"), f"{args.result} has no times; leave this option out")
         return np.arange(1)
-    if args.times is None:
-        count = times.size if args.points is not None else MANY
-    else:
-        wanted, count = parse_times(args.times)
-        if wanted:
-            apart = np.abs(np.log(times) - np.log(wanted)[:, None])
-            far = apart.min(axis=1) > 0.05
-            if far.any():
-                raise ValueError(
-                    f"--times: got {wanted[int(np.argmax(far))]:g}; expected some of the saved times, "
-                    f"{', '.join(f'{t:.4g}' for t in times)}"
-                )
-            return np.unique(np.argmin(apart, axis=1))
+    wanted, count = parse_times(args.times) if args.times else ((), times.size if args.points else MANY)
+    if wanted:
+        apart = np.abs(np.log(times) - np.log(wanted)[:, None])
+        far = apart.min(axis=1) > 0.05
+        if far.any():
+            raise ValueError(
+                f"--times: got {wanted[int(np.argmax(far))]:g}; expected some of the saved times, "
+                f"{', '.join(f'{t:.4g}' for t in times)}"
+            )
+        return np.unique(np.argmin(apart, axis=1))
     return np.unique(np.linspace(0, times.size - 1, min(count, times.size)).round().astype(int))
 
 
@@ -132,18 +130,17 @@ def _panels(result: Result, args: argparse.Namespace) -> Any:
     )
 
 
-def _curves(result: Result, args: argparse.Namespace) -> Any:
+def _curves(result: Result, args: argparse.Namespace, scaled: bool) -> Any:
     from hks_jax.plot import hks_curves, new_figure
     from hks_jax.plot.signature import placed
 
-    values, volume = result.values / (result.flat_scale if args.scaled else 1), result.volume
-    grid, d = result.grid, volume.dimension
-    orientation = placed(volume, None, "neurological")
+    values, grid, d = result.values, result.grid, result.dimension
+    orientation = placed(result.volume, None, "neurological")
     if orientation is not None:  # points are in the coordinates of the images' axes
         values, grid = orientation.array(values), orientation.grid(grid)
     if any(len(point) != d for point in args.points):
         raise ValueError(f"--points: got {args.points}; expected {d} coordinates per point")
-    style = {"scaled": args.scaled, "cmap": args.cmap, "unit": args.unit or ""}
+    style = {"scaled": scaled, "cmap": args.cmap, "unit": args.unit or ""}
     if result.eigenvalues.size:
         style["limit"] = RESOLVED[d] / float(result.eigenvalues[-1])
     figure = new_figure(5.4, 4.0)

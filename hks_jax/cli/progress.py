@@ -37,6 +37,7 @@ class Progress:
     """Print stages and warnings at once, and store them for the report.
 
     Attributes:
+        start: the time from which elapsed times count.
         timings: the seconds of each stage.
         warnings: the messages of warnings, without duplicates.
     """
@@ -48,7 +49,7 @@ class Progress:
         self.stream = sys.stderr if stream is None else stream
         self.timings: dict[str, float] = {}
         self.warnings: list[str] = []
-        self._start = self._last = self._begin = time.perf_counter()
+        self.start = self._last = self._begin = time.perf_counter()
         self._subject = self._stage = self._text = ""
         self._end: float | None = None
         self._open_line = False
@@ -91,7 +92,7 @@ class Progress:
         """Print a text that is not a warning."""
         if not self.quiet:
             self._close_line()
-            print(f"[{time.perf_counter() - self._start:7.1f} s] {text}", file=self.stream, flush=True)
+            print(f"[{time.perf_counter() - self.start:7.1f} s] {text}", file=self.stream, flush=True)
 
     def warn(self, message: str) -> None:
         """Print a warning, unless it was printed before; `quiet` does not suppress it."""
@@ -137,7 +138,7 @@ class Progress:
             done = (now - self._begin) / max(now - self._begin + left, 1e-9)
             remaining = f"about {duration(left)} left" if left else "longer than estimated"
             shown = f"{bar(done)} {remaining}, {self._text}, {self._stage}"
-        return f"[{now - self._start:7.1f} s] {shown}"
+        return f"[{now - self.start:7.1f} s] {shown}"
 
     def _close_line(self) -> None:
         with self._lock:

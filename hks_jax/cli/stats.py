@@ -35,8 +35,6 @@ result RESULT  the folder OUT that 'hks-jax hks' wrote, or an .npz from there
 @names
 """
 
-_SOME = ("lambda1_t", "error")
-"""Columns that only some tables have."""
 _SCALES = {
     "raw": "the heat kernel signature, per (metric length)^d",
     "heat-trace": "the heat kernel signature divided by the heat trace",
@@ -95,14 +93,14 @@ def region_table(
     if "noise_maps" in result.arrays:  # the variance of the mean is that of means of noise
         draws = [region_statistics(one, labels).mean for one in result.arrays["noise_maps"]]
         cells["error"] = np.sqrt(np.mean(np.square(draws), axis=0)).T.ravel()
-    described = _about(result, atlas, names)
-    columns = tuple(name for name in described if name in cells)
+    about = {name: of for name, of in _about(result, atlas, names).items() if name in cells or name[0].isupper()}
+    columns = tuple(name for name in about if name in cells)
     rows = list(zip(*(cells[name].tolist() for name in columns), strict=True))
-    return columns, rows, {name: what for name, what in described.items() if name in columns or name not in _SOME}
+    return columns, rows, about
 
 
 def _about(result: Result, atlas: Path, names: Path | None) -> dict[str, Any]:
-    """Return the sidecar, with descriptions of the columns in order, and their origin."""
+    """Return the sidecar: descriptions of all columns in order and, with capital letters, their origin."""
     settings = result.settings
     flat = result.volume.dimension == 2 and result.volume.affine is None
     values = _SCALES.get(settings.get("normalisation", "raw"), "the heat kernel signature")

@@ -90,7 +90,10 @@ def bumpy_torus_mesh(n: int) -> SurfaceMesh:
         0
     """
     nodes = jnp.asarray(_periodic_grid((n, n)).nodes).reshape(-1, 2)
-    return SurfaceMesh(jax.vmap(bumpy_torus)(nodes), _periodic_triangles(n))
+    i, j = (axis.ravel() for axis in np.indices((n, n)))
+    a, b, c, d = (((i + p) % n) * n + (j + q) % n for p, q in ((0, 0), (1, 0), (1, 1), (0, 1)))
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    return SurfaceMesh(jax.vmap(bumpy_torus)(nodes), faces)
 
 
 def sphere_mesh(n: int) -> SurfaceMesh:
@@ -127,12 +130,6 @@ def ball_mesh(n: int) -> TetMesh:
 
 def _periodic_grid(shape: Sequence[int]) -> Grid:
     return Grid(shape, [2 * pi / n for n in shape])
-
-
-def _periodic_triangles(n: int) -> np.ndarray:
-    i, j = (axis.ravel() for axis in np.indices((n, n)))
-    a, b, c, d = (((i + p) % n) * n + (j + q) % n for p, q in ((0, 0), (1, 0), (1, 1), (0, 1)))
-    return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
 
 
 def _stereographic(x: Float[Array, " 2"], sign: float) -> Float[Array, "2 2"]:

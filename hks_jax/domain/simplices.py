@@ -146,20 +146,16 @@ def check_places(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulatio
         )
 
 
-def check_metric(metric: Float[np.ndarray, "n d d"], vertices: Float[np.ndarray, "V 3"], cells: np.ndarray) -> None:
+def check_metric(metric: Float[np.ndarray, "n d d"], cells: Int[np.ndarray, "n corners"]) -> None:
     """Raise ValueError if the metric of space on a simplex is NaN, because its height is lost to rounding."""
     thin = np.isnan(metric).any(axis=(1, 2))
     if not thin.any():
         return
-    first = int(np.argmax(thin))
-    words, corners = WORDS[cells.shape[1] - 1], vertices[cells[first]]
-    longest = max(np.linalg.norm(a - b) for a, b in combinations(corners, 2))
-    height = np.abs(signed_measure(vertices, cells[first : first + 1])[0][0]) / longest ** (cells.shape[1] - 1)
+    first, words = int(np.argmax(thin)), WORDS[cells.shape[1] - 1]
     raise ValueError(
         f"{words.argument}: {int(thin.sum())} of {len(cells)} {words.simplices} are so thin that their metric is lost "
-        f"to rounding in {metric.dtype} (the first is {words.one} {first}, vertices {cells[first].tolist()}, with a "
-        f"height of {height:.1e} if its longest edge is 1); merge or move their vertices"
-        f"{', or use float64' * (metric.dtype != np.float64)}"
+        f"to rounding in {metric.dtype} (the first is {words.one} {first}, vertices {cells[first].tolist()}); merge or "
+        f"move their vertices{', or use float64' * (metric.dtype != np.float64)}"
     )
 
 

@@ -10,9 +10,15 @@ from jaxtyping import Array, Float, Int
 from hks_jax.arrays import StaticArray, describe_array
 from hks_jax.checks import real_array
 from hks_jax.domain import spd
-from hks_jax.domain.mesh_tensors import metric_of_tensors
 from hks_jax.domain.simplices import WORDS, check_metric, check_places, checked_cells, checked_mask
-from hks_jax.domain.tensor_checks import Interpolation, MetricChoice, require_spd
+from hks_jax.domain.tensor_checks import (
+    Interpolation,
+    MetricChoice,
+    check_metric_choice,
+    checked_interpolation,
+    require_finite_symmetric,
+    require_spd,
+)
 from hks_jax.domain.triangulation import Triangulation
 from hks_jax.traced import is_traced
 
@@ -41,7 +47,7 @@ class SimplicialMesh(eqx.Module):
             check_places(np.asarray(positions, np.float64), triangulation)
         self._metric = None if metric is None else _checked_metric(self.restrict(metric), triangulation)
         if metric is None and not is_traced(positions):
-            check_metric(np.asarray(self.metric), np.asarray(positions, np.float64), triangulation.cells)
+            check_metric(np.asarray(self.metric), triangulation.cells)
 
     @classmethod
     def from_tensors(
@@ -82,7 +88,7 @@ class SimplicialMesh(eqx.Module):
                 not positive definite (with their number and the first place); the errors of the class.
         """
         mesh = cls(vertices, cells, mask=mask)
-        of_cells = metric_of_tensors(mesh._edges, mesh.triangulation, mesh.restrict(tensors), metric, at, interpolation)
+        of_cells = _metric_of_tensors(mesh, tensors, metric, at, interpolation)
         given = _checked_metric(of_cells, mesh.triangulation)  # an inverse may overflow
         return eqx.tree_at(lambda m: m._metric, mesh, given, is_leaf=lambda leaf: leaf is None)
 
@@ -166,9 +172,7 @@ class TetMesh(SimplicialMesh):
         cells: vertex indices (C, 4).
         metric: (C, 3, 3), the metric of each tetrahedron in the basis of its edges v₁ − v₀, v₂ − v₀ and v₃ − v₀, in
             place of the metric of space. For tensors in the axes of space see `from_tensors`.
-        mask: the domain as bool, True inside: (C,) for the tetrahedra, or (V,) for the vertices, where a tetrahedron is
-            inside if all of its vertices are. Tetrahedra outside may be degenerate or NaN. The rim of the mask belongs
-            to the boundary, results are NaN at vertices outside, and ``cells`` has the tetrahedra inside.
+        mask: the domain as bool, (C,) for the tetrahedra or (V,) for the vertices, as for `SurfaceMesh`.
 
     Raises:
         ValueError: wrong shapes; a mask without tetrahedra; indices out of range; vertices without a cell; NaN; a
@@ -212,3 +216,87 @@ def _checked_metric(metric: Any, triangulation: Triangulation) -> Float[Array, "
     if not is_traced(array):
         require_spd("metric", np.asarray(array), np.ones(n, dtype=bool), words.one)
     return spd.symmetrise(array)
+
+
+def _metric_of_tensors(
+    mesh: SimplicialMesh, tensors: Any, metric: MetricChoice | None, at: str | None, interpolation: Interpolation
+) -> Float[Array, "n d d"]:
+    """Return the metric of tensors in space, in the basis of each cell's edges; triangles take the tangential part."""
+    check_metric_choice(metric)
+    checked_interpolation(interpolation)
+    array, edges, triangulation = real_array("tensors", mesh.restrict(tensors)), mesh._edges, mesh.triangulation
+    at_vertices = _place(array.shape, triangulation, at) == "vertices"
+    if not is_traced((array, edges)):
+        _check_tensors(np.asarray(array), np.asarray(edges), triangulation, at_vertices)
+    corners = triangulation.cells if at_vertices else np.arange(len(array))[:, None]
+    frames = _orthonormal(edges)
+    parts = jnp.einsum("nxa,ncxy,nyb->ncab", frames, spd.symmetrise(array)[corners], frames, precision="highest")
+    # The tensors at all vertices of a cell, and not only their mean, must be positive definite.
+    parts = spd.positive_or_nan(parts)
+    # The logarithm is that of the tangential part, since tensors may be indefinite across a surface.
+    if interpolation == "linear" or not at_vertices:
+        part = jnp.mean(parts, axis=1)
+    else:
+        part = spd.exp(jnp.mean(spd.log(parts), axis=1))
+    if metric != "tensor":
+        part = spd.inverse(part) if metric == "inverse" else spd.adjugate(part)
+    coordinates = jnp.einsum("nxa,nxb->nab", frames, edges, precision="highest")
+    return jnp.einsum("nab,nac,ncd->nbd", coordinates, part, coordinates, precision="highest")
+
+
+def _orthonormal(edges: Float[Array, "n 3 d"]) -> Float[Array, "n 3 d"]:
+    """Return an orthonormal basis, as columns, of each triangle's plane by Gram–Schmidt, or of space."""
+    if edges.shape[-1] == 3:
+        return jnp.broadcast_to(jnp.eye(3, dtype=edges.dtype), edges.shape)
+    first, second = edges[..., 0], edges[..., 1]
+    first = first / jnp.linalg.norm(first, axis=-1, keepdims=True)
+    second = second - jnp.sum(first * second, axis=-1, keepdims=True) * first
+    return jnp.stack([first, second / jnp.linalg.norm(second, axis=-1, keepdims=True)], axis=-1)
+
+
+def _place(shape: tuple[int, ...], triangulation: Triangulation, at: str | None) -> str:
+    """Return whether tensors of this shape belong to the vertices or to the cells (the faces of a surface)."""
+    words = WORDS[triangulation.dimension]
+    counts = {words.argument: len(triangulation.cells), "vertices": triangulation.n_vertices}
+    if at not in (None, *counts):
+        raise ValueError(f'at: got {at!r}; expected "{words.argument}", "vertices" or None')
+    fitting = [place for place, n in counts.items() if shape == (n, 3, 3) and at in (None, place)]
+    if len(fitting) == 1:
+        return fitting[0]
+    if fitting:
+        raise ValueError(
+            f"at: the mesh has as many {words.argument} as vertices, {shape[0]}, and tensors of shape {shape} may "
+            f'belong to either; pass at="{words.argument}" or at="vertices"'
+        )
+    one = {words.argument: words.one, "vertices": "vertex"}
+    expected = [f"({n}, 3, 3), one per {one[place]}" for place, n in counts.items() if at in (None, place)]
+    raise ValueError(f"tensors: got shape {shape}; expected {', or '.join(expected)}")
+
+
+def _check_tensors(
+    tensors: Float[np.ndarray, "m 3 3"],
+    edges: Float[np.ndarray, "n 3 d"],
+    triangulation: Triangulation,
+    at_vertices: bool,
+) -> None:
+    """Raise ValueError unless the tensors are finite, symmetric, and positive definite on the cells that use them."""
+    words = WORDS[triangulation.dimension]
+    everywhere = triangulation.used if at_vertices else np.ones(len(tensors), dtype=bool)
+    place = "vertex" if at_vertices else words.one
+    if triangulation.dimension == 3:
+        return require_spd("tensors", tensors, everywhere, place)
+    require_finite_symmetric("tensors", tensors, everywhere, place)
+    # In orthonormal frames, the eigenvalues do not depend on the shape of the triangle.
+    frames = np.linalg.qr(edges.astype(np.float64))[0]
+    owners = triangulation.cells if at_vertices else np.arange(len(tensors))[:, None]
+    parts = np.einsum("nxa,nixy,nyb->niab", frames, tensors[owners], frames)
+    least = np.linalg.eigvalsh(parts)[..., 0]
+    bad = least <= np.finfo(tensors.dtype).eps * np.abs(tensors).max(axis=(1, 2))[owners]
+    if bad.any():
+        which = np.unique(owners[bad])
+        raise ValueError(
+            f"tensors: {which.size} of {len(tensors)} tensors are not positive definite on "
+            f"{'the faces around them' if at_vertices else 'their face'} (the first at {place} {which[0]}), "
+            f"worst eigenvalue {least[bad].min():.3g}; expected tensors whose tangential part is "
+            "symmetric positive definite. Raise their eigenvalues, or check that their axes are those of the vertices"
+        )

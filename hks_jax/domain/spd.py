@@ -180,7 +180,10 @@ def _log_by_eigenvalues(tensors: Float[Array, "... d d"]) -> Float[Array, "... d
 def _log_by_eigenvalues_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     values, vectors = eigh(primals[0])
     a, b = values[..., :, None], values[..., None, :]
-    differences = 2 / (a + b) * _atanhc((a - b) / (a + b))
+    x = (a - b) / (a + b)
+    small = jnp.abs(x) < 1e-2
+    atanhc = jnp.where(small, 1 + x**2 / 3 + x**4 / 5 + x**6 / 7, jnp.arctanh(x) / jnp.where(small, 1, x))  # atanh(x)/x
+    differences = 2 / (a + b) * atanhc
     inner = matmul(jnp.swapaxes(vectors, -1, -2), tangents[0], vectors)
     return _log_of_pairs(values, vectors), _compose(vectors, differences * inner)
 
@@ -196,9 +199,3 @@ def _log_of_pairs(values: Float[Array, "... d"], vectors: Float[Array, "... d d"
 
 def _compose(vectors: Float[Array, "... d d"], inner: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
     return symmetrise(matmul(vectors, inner, jnp.swapaxes(vectors, -1, -2)))
-
-
-def _atanhc(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return atanh(x)/x."""
-    small = jnp.abs(x) < 1e-2
-    return jnp.where(small, 1 + x**2 / 3 + x**4 / 5 + x**6 / 7, jnp.arctanh(x) / jnp.where(small, 1, x))

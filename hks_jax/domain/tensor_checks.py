@@ -35,10 +35,15 @@ def checked_interpolation(interpolation: Any) -> Interpolation:
     return interpolation
 
 
-def tensors_on(grid: Any, name: str, tensors: Any) -> Float[Array, "*shape d d"]:
-    """Return tensors at the nodes of a grid as floating-point numbers; raise ValueError for another shape."""
+def require_grid(grid: Any) -> None:
+    """Raise TypeError for anything that is not a grid."""
     if not isinstance(grid, Grid):
         raise TypeError(f"grid: got {type(grid).__name__}; expected hks_jax.Grid")
+
+
+def tensors_on(grid: Any, name: str, tensors: Any) -> Float[Array, "*shape d d"]:
+    """Return tensors at the nodes of a grid as floating-point numbers; raise ValueError for another shape."""
+    require_grid(grid)
     array, expected = real_array(name, tensors), (*grid.shape, grid.dimension, grid.dimension)
     if array.shape != expected:
         raise ValueError(f"{name}: got shape {array.shape}; expected (*grid.shape, d, d) = {expected}")
@@ -109,8 +114,8 @@ def right_cauchy_green(name: str, grid: Grid, F: Any) -> Float[Array, "*shape d 
     Raises:
         ValueError: a wrong shape; square gradients whose determinant is not positive.
     """
-    gradients = real_array(name, F)
-    d = grid.dimension
+    require_grid(grid)
+    gradients, d = real_array(name, F), grid.dimension
     shape, (m, n) = gradients.shape[:-2], gradients.shape[-2:] if gradients.ndim >= 2 else (0, 0)
     if shape != grid.shape or n != d or m < d:
         expected = (*grid.shape, d, d)

@@ -81,12 +81,18 @@ class TensorField(eqx.Module):
             -1.0
         """
         function: Any = fn if isinstance(fn, jtu.Partial | eqx.Module) else jtu.Partial(fn)
-        field = cls.__new__(cls)
-        object.__setattr__(field, "grid", grid)
-        object.__setattr__(field, "interpolation", checked_interpolation(interpolation))
-        object.__setattr__(field, "function", function)
-        object.__setattr__(field, "_tensors", None)
         _checked_tensors("fn", grid, _evaluate(function, grid))
+        return cls._checked(grid, interpolation, function=function)
+
+    @classmethod
+    def _checked(
+        cls, grid: Grid, interpolation: Interpolation, tensors: Any = None, function: Any = None
+    ) -> "TensorField":
+        """Return a field without another check of its tensors."""
+        field, interpolation = cls.__new__(cls), checked_interpolation(interpolation)
+        values = {"grid": grid, "interpolation": interpolation, "function": function, "_tensors": tensors}
+        for name, value in values.items():
+            object.__setattr__(field, name, value)
         return field
 
     @classmethod
@@ -118,7 +124,7 @@ class TensorField(eqx.Module):
         check_metric_choice(metric)
         tensors = spd.symmetrise(_checked_tensors(name, grid, D))
         if metric == "tensor":
-            return cls(grid, tensors, interpolation)
+            return cls._checked(grid, interpolation, tensors)
         # This comes first, since in three dimensions −D and D have the same adjugate.
         tensors = spd.positive_or_nan(spd.identity_outside(tensors, grid.inside))
         return cls(grid, spd.inverse(tensors) if metric == "inverse" else spd.adjugate(tensors), interpolation)
@@ -150,8 +156,8 @@ class TensorField(eqx.Module):
             >>> print(hj.TensorField.from_deformation(field.grid, shear).tensors[4, 4].tolist())
             [[1.0, 1.0], [1.0, 2.0]]
         """
-        C = right_cauchy_green(name, grid, F)
-        return cls(grid, _checked_tensors(f"{name}ᵀ{name}", grid, C), interpolation)
+        C = _checked_tensors(f"{name}ᵀ{name}", grid, right_cauchy_green(name, grid, F))
+        return cls._checked(grid, interpolation, spd.symmetrise(C))
 
     @classmethod
     def from_indefinite(
@@ -177,7 +183,6 @@ class TensorField(eqx.Module):
         docs/strain.md describes their signatures.
 
         Args:
-            grid: the grid.
             S: the tensors; values outside the mask are ignored.
             how: ``"exp"`` or ``"shift"``.
             number: the scale or the shift; may be traced.
@@ -195,7 +200,7 @@ class TensorField(eqx.Module):
             [3. 1.]
         """
         mapped = positive_map(name, tensors_on(grid, name, S), how, number, grid.inside)
-        return cls(grid, mapped, interpolation)
+        return cls._checked(grid, interpolation, spd.symmetrise(mapped))
 
     def __repr__(self) -> str:
         values = "a function" if self.function is not None else describe_array(self._tensors)

@@ -94,9 +94,7 @@ def fit_metric(
         chosen = choose_for_fit(pencil, pairs) if solver == "auto" else solver
         return Problem(unknowns, observed, tuple(regularisers), pairs, boundary, chosen)
 
-    problems = [
-        problem_of(stage, stage.pairs_needed(k, pencil, init)) for stage in observed.stages(search.continuation)
-    ]
+    problems = [problem_of(each, each.pairs_needed(k, pencil, init)) for each in observed.stages(search.continuation)]
     first, inner_product = unknowns.start(), choose_inner_product(unknowns, search.smoothness, noise)
     settings = {**vars(data), **vars(search), "max_steps": None}
     kind = unknowns.parametrisation.tensors if isinstance(unknowns, Nodal) else None

@@ -152,9 +152,8 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _State]):
         tolerance = jnp.where(state.tight, self.inner_tolerance / _TIGHTER, self.inner_tolerance)
         most = jnp.where(state.tight, _LONGER * self.inner_steps, self.inner_steps)
         most = jnp.where(needed & ~self._done(state), most, 0)
-        solution = conjugate_gradients(
-            normal, precondition, y.reshape(-1, 1), tolerance[None], most=most, orthogonal=True
-        )
+        like = y.reshape(-1, 1)
+        solution = conjugate_gradients(normal, precondition, like, tolerance[None], most=most, orthogonal=True)
         x, gradient = solution.x.reshape(shape), solution.rhs.reshape(shape)
         promised = -(jnp.vdot(gradient, x) + damping * jnp.vdot(x, self.inner_product.apply(x))) / 2
         # A stationary point needs no step; a step of size zero would show no convergence.
@@ -206,8 +205,6 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _State]):
         successful, not_finite = optx.RESULTS.successful, optx.RESULTS.nonlinear_divergence
         return self._done(state), optx.RESULTS.where(state.finite, successful, not_finite)
 
-    def postprocess(
-        self, fn: Callable, y: Values, aux: Any, *args: Any, **settings: Any
-    ) -> tuple[Values, Any, dict[str, Any]]:
+    def postprocess(self, fn: Callable, y: Values, aux: Any, *args: Any, **settings: Any) -> tuple[Values, Any, dict]:
         """Return the unknowns and the auxiliary output unchanged."""
         return y, aux, {}

@@ -43,7 +43,7 @@ class H1(Regulariser):
 
     Examples:
         >>> smooth = [hj.inverse.H1(1.0)]
-        >>> hj.fit_metric(field, hj.hks(pairs, [0.5]), [0.5], "conformal", regularisers=smooth).converged
+        >>> hj.fit_metric(field, hj.hks(pairs, [0.5]), [0.5], "conformal", regularisers=smooth).loss < 1e-6
         True
     """
 
@@ -63,7 +63,7 @@ class TotalVariation(Regulariser):
 
     Examples:
         >>> smooth = [hj.inverse.TotalVariation(1.0)]
-        >>> hj.fit_metric(field, hj.hks(pairs, [0.5]), [0.5], "conformal", regularisers=smooth).converged
+        >>> hj.fit_metric(field, hj.hks(pairs, [0.5]), [0.5], "conformal", regularisers=smooth).loss < 1e-6
         True
     """
 

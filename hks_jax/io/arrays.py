@@ -38,10 +38,8 @@ def _read_tensors(
             "(*shape, d, d). The file may also have 'spacing', 'origin', 'mask', 'affine', 'order' and 'frame'"
         )
     values = arrays[wanted]
-    if values.dtype not in (np.float32, np.float64):
-        if values.dtype.kind not in "fiu":
-            raise ValueError(f"{name}: got {wanted!r} of dtype {values.dtype}; expected real numbers")
-        values = values.astype(np.float64)
+    if values.dtype != np.float32:
+        values = _real(f"{name}: {wanted}", values)
     order = order or _text(arrays, "order") or None
     if (values.ndim, values.shape[-1:]) in ((4, (6,)), (3, (3,))):
         found = matrices(name, values, order)

@@ -12,9 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hks_jax.checks import require_number
-from hks_jax.domain.components import as_mask
 from hks_jax.io import nifti
-from hks_jax.io.masks import read_mask
+from hks_jax.io.masks import mask_on
 from hks_jax.io.tensor_order import Matrices, pack, to_voxel_axes, unpack
 from hks_jax.io.units import MM2_PER_S, UNITS, Unit, b_value_question
 from hks_jax.io.volume import TensorVolume, digest, placed
@@ -258,9 +257,7 @@ def _inside(
         inside = brain.astype(bool)
         notes.append(f"no mask given: DIPY's median_otsu finds {int(inside.sum())} voxels in the unweighted images")
     else:
-        inside = as_mask("mask", mask) if isinstance(mask, np.ndarray) else read_mask(mask, affine)
-        if inside.shape != signal.shape[:3]:
-            raise ValueError(f"mask: got shape {inside.shape}; expected the images' shape {signal.shape[:3]}")
+        inside = mask_on(signal.shape[:3], affine, mask)
     usable = inside & finite.all(axis=-1)
     if inside.any() and not usable.any():
         whole = [str(n) for n in np.flatnonzero(~finite[inside].any(axis=0))]

@@ -11,12 +11,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hks_jax.checks import require_number
-from hks_jax.domain.components import as_mask
 from hks_jax.domain.simplices import WORDS
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.io import mesh, nifti
 from hks_jax.io.formats import WRITTEN, format_of
-from hks_jax.io.masks import read_mask
+from hks_jax.io.masks import mask_on
 from hks_jax.io.repair import Repair, repair_tensors
 from hks_jax.io.tensor_order import Frame, Order
 from hks_jax.io.units import Unit, in_mm2_per_s
@@ -107,10 +106,7 @@ def read_tensors(
     if unit is not None:
         volume = in_mm2_per_s(volume, unit)
     if mask is not None:
-        inside = as_mask("mask", mask) if isinstance(mask, np.ndarray) else read_mask(mask, volume.affine)
-        if inside.shape != volume.shape:
-            raise ValueError(f"mask: got shape {inside.shape}; expected the tensors' shape {volume.shape}")
-        volume = volume.with_mask(inside)
+        volume = volume.with_mask(mask_on(volume.shape, volume.affine, mask))
     return volume if repair is None else repair_tensors(volume, repair)
 
 
@@ -146,9 +142,6 @@ def save(
         name: the name of the values in the file.
         extra: more arrays, such as the times; NIfTI allows only the times.
         provenance: more entries of the record, such as the settings of the computation.
-
-    Returns:
-        The path.
 
     Raises:
         ValueError: the suffix is unknown, or the values have another shape.

@@ -46,6 +46,16 @@ def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) ->
     return as_mask(name, values)
 
 
+def mask_on(
+    shape: tuple[int, ...], affine: np.ndarray | None, mask: str | os.PathLike[str] | np.ndarray
+) -> Bool[np.ndarray, "*shape"]:
+    """Return a mask, from a file or an array, for an image of this shape; raise ValueError for another shape."""
+    inside = as_mask("mask", mask) if isinstance(mask, np.ndarray) else read_mask(mask, affine)
+    if inside.shape != shape:
+        raise ValueError(f"mask: got shape {inside.shape}; expected the shape of the image, {shape}")
+    return inside
+
+
 def erode(mask: Bool[np.ndarray, "*shape"], iterations: int = 1) -> Bool[np.ndarray, "*shape"]:
     """Remove the boundary voxels of a mask, because they contain several tissues and their tensors are unreliable.
 
@@ -67,10 +77,6 @@ def erode(mask: Bool[np.ndarray, "*shape"], iterations: int = 1) -> Bool[np.ndar
     if not eroded.any():
         raise ValueError(f"iterations: got {iterations}, which removes all {int(mask.sum())} voxels. Choose fewer")
     return eroded
-
-
-NEAR = 0.1
-"""The distance, in voxels, up to which two images count as being on the same voxels."""
 
 
 def read_labels(path: str | os.PathLike[str], on: TensorVolume | SimplicialMesh) -> Integer[np.ndarray, "*shape"]:
@@ -139,7 +145,7 @@ def _at_voxels(name: str, values: np.ndarray, to_labels: np.ndarray, volume: Ten
     apart = np.abs((ends @ to_labels.T)[:, :3] - ends[:, :3] - first).max()
     box = tuple(slice(int(i), int(i) + n) for i, n in zip(first, size, strict=True))
     inside = all(i >= 0 and i + n <= m for i, n, m in zip(first, size, values.shape, strict=True))
-    if apart > NEAR or not inside:
+    if apart > 0.1 or not inside:  # in voxels
         if values.shape != tuple(size) and np.allclose(to_labels, np.eye(4)):
             raise ValueError(
                 f"{name}: got labels of shape {values.shape} with the image's affine; expected the image's shape "

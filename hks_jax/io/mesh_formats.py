@@ -177,15 +177,13 @@ def fans(
     Raises:
         ValueError: a vertex does not exist, or a polygon has no such corner; `numbers` are its numbers in the file.
     """
-    size, used = polygons.shape[-1], polygons if polygons.size else np.zeros(1, int)
-    if polygons.ndim != 2 or size < 3 or not 0 <= used.min() <= used.max() < len(points):
-        raise ValueError(
-            f"{file}: got faces of shape {polygons.shape} with vertices from {used.min()} to {used.max()}; expected "
-            f"at least 3 corners each, and vertices from 0 to {len(points) - 1}"
-        )
+    if polygons.ndim != 2 or polygons.shape[1] < 3:
+        raise ValueError(f"{file}: got faces of shape {polygons.shape}; expected at least 3 corners each")
+    (n, size), low, high = polygons.shape, polygons.min(initial=0), polygons.max(initial=0)
+    if low < 0 or high >= len(points):
+        raise ValueError(f"{file}: a face refers to vertex {low if low < 0 else high}; expected 0 … {len(points) - 1}")
     if size == 3:
         return polygons[:, None]
-    n = len(polygons)
     found = np.full((n, size - 2, 3), -1)
     for first in reversed(range(size)):
         turned = np.roll(polygons, -first, axis=1)

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -12,20 +13,8 @@ from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.pencil import AnyPencil
 from hks_jax.storage import load_npz, write_npz
 
-ARRAYS = (
-    "eigenvalues",
-    "vectors",
-    "residuals",
-    "converged",
-    "kept",
-    "lowest",
-    "spectral_origin",
-    "part",
-    "next_eigenvalue",
-    "complete_below",
-    "multiplet_tolerance",
-)
-"""The fields of `hks_jax.Eigenpairs` that a file contains; the matrices are not saved."""
+ARRAYS = tuple({field.name for field in fields(Eigenpairs)} - {"frame", "pencil", "solver_name"})
+"""The fields of `hks_jax.Eigenpairs` that are saved as arrays; `frame` has the values of `vectors`."""
 _FAR = 1e-3
 """The residual, relative to the next eigenvalue, above which pairs count as belonging to another pencil."""
 
@@ -39,9 +28,6 @@ def save_pairs(path: str | os.PathLike[str], pairs: Eigenpairs, extra: Mapping[s
         path: the file, ``.npz``, which is written atomically; missing folders are created.
         pairs: the result of `hks_jax.eigenpairs`, with concrete values.
         extra: more named arrays.
-
-    Returns:
-        The path.
 
     Raises:
         ValueError: the suffix is not ``.npz``.

@@ -64,7 +64,8 @@ class Coherence(NamedTuple):
         worse = [f"along the {a.name} axes" for a in self.worse if a.is_frame]
         if flips := [a.name for a in self.worse if not a.is_frame]:
             worse.append(f"with {', '.join(flips)} reversed")
-        return f"{_SAID} {self.angle:.1f}° on average, and clearly more {', or '.join(worse)}" if worse else ""
+        said = f"The axes of the tensors seem right. {_SAID} {self.angle:.1f}° on average, and clearly more"
+        return f"{said} {', or '.join(worse)}" if worse else ""
 
     def question(self, option: str) -> str:
         """Return a question whether the argument `option` is wrong, or the empty text if no other axes are better."""
@@ -150,22 +151,15 @@ def _angles(
 
 def _alternatives(volume: TensorVolume) -> list[tuple[str, bool, Float[np.ndarray, "3 3"]]]:
     """Return alternative axes, frames first: the name, whether it is a frame, and the matrix applied to directions."""
-    affine = volume.volume_affine
-    to_voxel = {
-        "voxel": np.eye(3),
-        "fsl": np.diag(fsl_signs(affine[:3, :3])),
-        "world": nearest_rotation(affine[:3, :3]).T,
-    }
-    candidates = []
-    if volume.frame in to_voxel:
-        back = to_voxel[volume.frame].T
-        candidates += [(name, True, turn @ back) for name, turn in to_voxel.items() if name != volume.frame]
-    flips = [np.diag([-1.0 if a == b else 1.0 for b in range(3)]) for a in range(3)]
-    candidates += [(AXES[a], False, flip) for a, flip in enumerate(flips)]
-    turn = to_voxel["world"]
-    candidates += [(f"scanner's {AXES[a]}", False, turn @ flip @ turn.T) for a, flip in enumerate(flips)]
+    linear = volume.volume_affine[:3, :3]
+    world = nearest_rotation(linear).T
+    to_voxel = {"voxel": np.eye(3), "fsl": np.diag(fsl_signs(linear)), "world": world}
+    back, flips = to_voxel.get(volume.frame), [np.diag(1 - 2 * axis) for axis in np.eye(3)]
+    frames = [] if back is None else [(name, True, turn @ back.T) for name, turn in to_voxel.items()]
+    axes = [(AXES[a], False, flip) for a, flip in enumerate(flips)]
+    scanners = [(f"scanner's {AXES[a]}", False, world @ flip @ world.T) for a, flip in enumerate(flips)]
     kept = [("own", True, np.eye(3))]
-    for name, is_frame, turn in candidates:
+    for name, is_frame, turn in (*frames, *axes, *scanners):
         # A rotation and its negative are equivalent for fibres, and rotations below 5° cannot be distinguished.
         if all(np.linalg.norm(turn - s * other, 2) > 0.09 for _, _, other in kept for s in (1, -1)):
             kept.append((name, is_frame, turn))
@@ -188,12 +182,7 @@ def questions(volume: TensorVolume) -> tuple[str, ...]:
 
     If lengths are in mm, the function also checks that the size of the voxels is usual for scans, and that the median
     mean diffusivity occurs in living tissue.
-
-    Args:
-        volume: the result of `read_tensors` or `fit_dwi`. For a slice, only the units are checked.
-
-    Returns:
-        The questions, each with a remedy; empty if no value looks wrong.
+    Each question comes with a remedy. For a slice, only the units are checked.
 
     Examples:
         >>> volume = hj.io.TensorVolume(np.array(field.tensors), (2.0, 2.0), (0.0, 0.0), length_unit="mm")

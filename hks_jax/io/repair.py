@@ -32,9 +32,6 @@ REPAIRS: dict[str, str] = {
 }
 """The methods of repair, with descriptions for messages."""
 
-LISTED = 20
-"""The largest number of voxels that a report lists."""
-
 _SAME, _TINY, _FILLED = 1e-6, 1e-6, 0.2
 """The tolerances for equal and for zero tensors, both relative, and the least share of voxels in the background."""
 
@@ -124,7 +121,7 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
         "not_finite": int((bad & ~finite).sum()),
         "worst_eigenvalue": least_eigenvalue(volume.tensors[finite]) if finite.any() else None,
         "box": [where.min(0).tolist(), where.max(0).tolist()] if count else None,
-        "first": where[:LISTED].tolist(),
+        "first": where[:20].tolist(),
     }
     if not count:
         return replace(volume, repair=report)

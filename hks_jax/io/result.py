@@ -12,10 +12,12 @@ import numpy as np
 from jaxtyping import Float
 
 from hks_jax import Grid, SurfaceMesh, TetMesh
+from hks_jax.arrays import describe_array
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.io.arrays import volume_of
 from hks_jax.io.files import save
+from hks_jax.io.units import median_mean_diffusivity
 from hks_jax.io.volume import TensorVolume
 from hks_jax.storage import load_npz
 
@@ -47,11 +49,17 @@ class Result:
     place: TensorVolume | SimplicialMesh
     values: Float[np.ndarray, "n_times *shape"]
     times: Float[np.ndarray, " n_known"]
-    eigenvalues: Float[np.ndarray, " k"]
-    report: Mapping[str, Any]
+    eigenvalues: Float[np.ndarray, " k"] = field(default_factory=lambda: np.zeros(0))
+    report: Mapping[str, Any] = field(default_factory=dict)
     arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
     name: str = "hks"
     source: str = ""
+
+    def __repr__(self) -> str:
+        """Return a summary in one line, without the arrays."""
+        times = f", {self.times.size} times {self.times.min():.4g} … {self.times.max():.4g}" * bool(self.times.size)
+        unit = f" {self.unit}" * bool(times and self.unit)
+        return f"Result({self.name}: {describe_array(self.values)}{times}{unit}, source={self.source!r})"
 
     @classmethod
     def read(cls, path: str | os.PathLike[str], name: str | None = None, over_times: bool = False) -> "Result":
@@ -137,37 +145,66 @@ class Result:
         return self.place
 
     @property
+    def dimension(self) -> int:
+        """The dimension of the volume, slice or mesh."""
+        place = self.place if isinstance(self.place, TensorVolume) else self.place.triangulation
+        return place.dimension
+
+    @property
     def grid(self) -> Grid:
         """The grid of the result, whose mask is the domain."""
         return self.volume.grid("all")
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        """The settings of the computation; empty if the file does not contain them."""
-        settings: Mapping[str, Any] = self.report["settings"]
-        return settings
+        """The settings of the computation; empty if they are not known."""
+        return dict(self.report.get("settings", {}))
+
+    @property
+    def normalisation(self) -> str:
+        """The normalisation of a signature, ``"raw"`` if it is not known."""
+        return str(self.settings.get("normalisation", "raw"))
+
+    @property
+    def tensors(self) -> Float[np.ndarray, "*shape d d"] | None:
+        """The tensors of a volume or slice; None for a mesh, and if the file of the result has none."""
+        known = isinstance(self.place, TensorVolume) and not (self.source and "input_tensors" not in self.arrays)
+        return self.volume.tensors if known else None
+
+    @property
+    def lengths(self) -> Float[np.ndarray, " n_times"] | None:
+        """(n_times,) the distances √(Dt) for the median mean diffusivity D in the domain, for the metric D⁻¹."""
+        if self.tensors is None or self.settings.get("metric") != "inverse":
+            return None
+        diffusivity = median_mean_diffusivity(self.volume.with_mask(np.isfinite(self.values[0])))
+        return np.sqrt(diffusivity * self.times) if diffusivity else None
 
     @property
     def z(self) -> Float[np.ndarray, "n_times *shape"] | None:
         """The difference from flat space or, for other normalisations, from the median, in standard deviations."""
         if "deviation" not in self.arrays:
             return None
-        normalisation = self.settings["normalisation"]
         flat = {"raw": 1 / self.flat_scale, "flat": 1.0}
         median = np.nanmedian(self.values, axis=tuple(range(1, self.values.ndim)), keepdims=True)
-        return (self.values - flat.get(normalisation, median)) / self.arrays["deviation"]
+        return (self.values - flat.get(self.normalisation, median)) / self.arrays["deviation"]
 
     @property
     def flat_scale(self) -> Float[np.ndarray, "n_times ..."]:
-        """(n_times, 1, …), the factor (4πt)^(d/2) of the normalisation ``"flat"`` of a grid of d dimensions."""
-        d = self.values.ndim - 1
-        return (4 * np.pi * self.times.reshape(-1, *[1] * d)) ** (d / 2)
+        """(n_times, 1, …), the factor (4πt)^(d/2) of the normalisation ``"flat"`` in d dimensions."""
+        return (4 * np.pi * self.times.reshape(-1, *[1] * (self.values.ndim - 1))) ** (self.dimension / 2)
 
     @property
     def unit(self) -> str:
-        """The unit of t: seconds for tensors from `fit_dwi`, whose units are mm²/s and mm; otherwise empty."""
-        fitted = isinstance(self.place, TensorVolume) and self.place.order == "fit"
-        return "s" if fitted and self.settings.get("metric") == "inverse" else ""
+        """The unit of t: seconds for the metric D⁻¹ of tensors in mm²/s and lengths in mm; empty if it is not known."""
+        place = self.place
+        known = isinstance(place, TensorVolume) and (place.order == "fit" or (place.unit and place.length_unit == "mm"))
+        return "s" if known and self.settings.get("metric") == "inverse" else ""
+
+    @property
+    def length_unit(self) -> str:
+        """The unit of lengths: mm for a volume with an affine, otherwise that of the volume, which may be empty."""
+        place = self.place
+        return "" if not isinstance(place, TensorVolume) else place.length_unit if place.affine is None else "mm"
 
 
 def signature_file(result: Path) -> Path:
@@ -177,12 +214,13 @@ def signature_file(result: Path) -> Path:
 
 def recorded_boundary(settings: Mapping[str, Any]) -> BoundarySpec | None:
     """Return the boundary in settings from JSON, with tuples in place of lists, or None."""
-
-    def tuples(value: Any) -> Any:
-        return tuple(map(tuples, value)) if isinstance(value, list) else value
-
     boundary: BoundarySpec | None = tuples(settings.get("boundary"))
     return boundary
+
+
+def tuples(value: Any) -> Any:
+    """Return a value from JSON with tuples in place of lists."""
+    return tuple(map(tuples, value)) if isinstance(value, list) else value
 
 
 def plain(value: Any) -> Any:

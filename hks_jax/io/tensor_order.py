@@ -1,18 +1,8 @@
 """The orders in which programs store the components of a symmetric tensor, and the axes of the components.
 
-The same numbers represent different tensors in programs that differ in the order or the axes:
-
-=========  =================  =======================================================================
-order      components         axes
-=========  =================  =======================================================================
-"nifti"    xx xy yy xz yz zz  NIfTI's symmetric matrix, DIPY, ANTs: voxel axes by default
-"fsl"      xx xy xz yy yz zz  FSL: voxel axes, the first reversed if the affine's determinant is > 0
-"mrtrix"   xx yy zz xy xz yz  MRtrix: scanner axes
-"vtk"      xx yy zz xy yz xz  VTK, ParaView: the axes of space
-=========  =================  =======================================================================
-
-The three components of a 2×2 tensor have the same sequence as among the six. NRRD's kinds of matrix
-have xx xy xz yy yz zz, along the axes of the measurement frame.
+The same numbers represent different tensors in programs that differ in the order or the axes. The three components of
+a 2×2 tensor have the same sequence as among the six. NRRD's kinds of matrix have xx xy xz yy yz zz, along the axes of
+the measurement frame.
 """
 
 import math
@@ -28,10 +18,10 @@ Order = Literal["nifti", "fsl", "mrtrix", "vtk"]
 Frame = Literal["voxel", "fsl", "world", "measurement"]
 
 ORDERS: dict[str, tuple[str, ...]] = {
-    "nifti": ("xx", "xy", "yy", "xz", "yz", "zz"),
+    "nifti": ("xx", "xy", "yy", "xz", "yz", "zz"),  # NIfTI's symmetric matrix, DIPY, ANTs
     "fsl": ("xx", "xy", "xz", "yy", "yz", "zz"),
     "mrtrix": ("xx", "yy", "zz", "xy", "xz", "yz"),
-    "vtk": ("xx", "yy", "zz", "xy", "yz", "xz"),
+    "vtk": ("xx", "yy", "zz", "xy", "yz", "xz"),  # VTK, ParaView
 }
 """The sequence of components in each order."""
 

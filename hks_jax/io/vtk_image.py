@@ -65,8 +65,7 @@ def _read_tensors(name: str, order: str | None, frame: str | None, array: str | 
             raise ValueError(f"got {image['kind']}; expected image data or structured points")
         if np.abs(image["direction"].T @ image["direction"] - np.eye(3)).max() > 1e-3:
             raise ValueError(f"Direction: got {image['direction'].tolist()}; expected orthonormal columns")
-    place = "point" if _tensors_at(image, "point", array) or not _tensors_at(image, "cell", array) else "cell"
-    chosen, declared = _tensor_array(name, image, place, array)
+    place, chosen, declared = _tensor_array(name, image, array)
     components = image[f"{place}:{chosen}"]
     with reading(file, kind):
         (_check_range if xml else _check_length)(content, chosen, components)
@@ -197,25 +196,24 @@ def _check_length(content: bytes, array: str, values: np.ndarray) -> None:
         raise ValueError(f"the file ends before the end of the array {array!r}; expected {values.size} values")
 
 
-def _tensors_at(image: Mapping[str, np.ndarray], place: str, name: str | None) -> list[str]:
-    """Return the names of the arrays with 6 or 9 components per row, only `name` unless it is None."""
-    keys = [key for key, a in image.items() if key.startswith(f"{place}:") and a.ndim == 2 and a.shape[1] in (6, 9)]
-    return [key.partition(":")[2] for key in keys if name in (None, key.partition(":")[2])]
-
-
-def _tensor_array(name: str, image: Mapping[str, np.ndarray], place: str, wanted: str | None) -> tuple[str, bool]:
-    """Return the name of the array of tensors, and whether the file declares that array as tensors."""
-    declared = str(image.get(f"{place}s declared", ""))
-    candidates = _tensors_at(image, place, wanted or declared or None)
-    if len(candidates) != 1:
-        had = {key.partition(":")[2]: a.shape[1:] for key, a in image.items() if key.startswith(f"{place}:")}
-        listed = ", ".join(f"{key!r} ({n[0] if n else 1})" for key, n in had.items()) or "none"
-        asked = "" if wanted is None else f" named {wanted!r}"
-        raise ValueError(
-            f"{name}: got the arrays (components) {listed}; expected one array of 6 or 9 components{asked}. Pass "
-            "array, the name of the one to read"
-        )
-    return candidates[0], candidates[0] == declared
+def _tensor_array(name: str, image: Mapping[str, np.ndarray], wanted: str | None) -> tuple[str, str, bool]:
+    """Return the place (point or cell) and the name of the array of tensors, and whether the file declares it so."""
+    for place in ("point", "cell"):
+        arrays = {key.partition(":")[2]: a for key, a in image.items() if key.startswith(f"{place}:")}
+        tensors = [n for n, a in arrays.items() if a.ndim == 2 and a.shape[1] in (6, 9) and wanted in (None, n)]
+        declared = str(image.get(f"{place}s declared", ""))
+        if declared in tensors or len(tensors) == 1:
+            chosen = declared if declared in tensors else tensors[0]
+            return place, chosen, chosen == declared
+        if tensors:
+            break
+    had = {key.partition(":")[2]: a.shape[1:] for key, a in image.items() if key.startswith(("point:", "cell:"))}
+    listed = ", ".join(f"{key!r} ({n[0] if n else 1})" for key, n in had.items()) or "none"
+    asked = "" if wanted is None else f" named {wanted!r}"
+    raise ValueError(
+        f"{name}: got the arrays (components) {listed}; expected one array of 6 or 9 components{asked}. Pass "
+        "array, the name of the one to read"
+    )
 
 
 def _on_grid(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

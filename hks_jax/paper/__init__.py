@@ -11,7 +11,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from hks_jax import plot
-from hks_jax.paper import figure6, figures, table1, triangles
+from hks_jax.paper import figures, table1, triangles
 from hks_jax.storage import atomic_path
 
 Echo = Callable[[str], None]
@@ -23,7 +23,7 @@ ITEMS: dict[str, Callable[[bool, Echo], Figure | dict[str, str]]] = {
     "figure3": figures.figure3,
     "figure4": figures.figure4,
     "figure5": figures.figure5,
-    "figure6": figure6.make,
+    "figure6": figures.figure6,
     "triangles": triangles.make,
 }
 """The functions of all items, each of which returns a figure, or texts by file name."""

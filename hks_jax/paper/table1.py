@@ -3,7 +3,6 @@
 import io
 import math
 from collections.abc import Callable
-from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import NamedTuple
@@ -57,15 +56,9 @@ def row(n: int, k: int, reference: Float[np.ndarray, "m m"]) -> Row:
     """Compare the HKS of the metric on n² nodes with a reference on m² nodes, where n divides m."""
     (values,) = signature(bumpy_torus_field(n), [TIME], k, boundary="periodic")
     fine = interpolate_periodic(values, len(reference) // n)
-    area = area_element(len(reference))
+    area = np.sqrt(np.linalg.det(np.asarray(bumpy_torus_field(len(reference)).tensors)))
     nodal, weighted = (relative_difference(fine, reference, w) for w in (np.ones_like(area), area))
     return Row(n, k, PAPER[n], INDEPENDENT[n], nodal, weighted)
-
-
-@cache
-def area_element(n: int) -> Float[np.ndarray, "n n"]:
-    """Return √|T| of the torus at the nodes of the n² grid."""
-    return np.sqrt(np.linalg.det(np.asarray(bumpy_torus_field(n).tensors)))
 
 
 def relative_difference(

@@ -93,7 +93,6 @@ def line_integral_convolution(
     contrast: float = 0.75,
     pixels: int | None = None,
     length: int = 25,
-    seed: int = 0,
     **kwargs: Any,
 ) -> AxesImage:
     """Shade an image by the line integral convolution of an eigenvector field.
@@ -108,7 +107,6 @@ def line_integral_convolution(
         contrast: the maximum opacity of black and white, in (0, 1].
         pixels: the texture's pixels along the longer side. The default is about 110 per inch of the axes.
         length: the same as for `lic_texture`.
-        seed: the seed of the noise.
         **kwargs: arguments of `scalar_image` for `values`.
 
     Returns:
@@ -129,7 +127,7 @@ def line_integral_convolution(
     x0, x1, y0, y1 = field.grid.extent
     if pixels is None:
         pixels = int(np.clip(PIXELS_PER_INCH * side_in_inches(ax, (x1 - x0, y1 - y0)), 100, 1200))
-    texture = lic_texture(field, which, pixels=pixels, length=length, seed=seed)
+    texture = lic_texture(field, which, pixels=pixels, length=length)
     if values is not None:
         scalar_image(ax, values, field.grid, **{"interpolation": "bilinear", **kwargs})
     shift = contrast * (2 * texture.T - 1)

@@ -11,14 +11,13 @@ from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.weyl import weyl_count
-from hks_jax.plot.figure import SMALL, number_text
+from hks_jax.plot.figure import SMALL
 from hks_jax.plot.panels import checked_times
 
 
@@ -64,28 +63,22 @@ def hks_curves(
         True
     """
     t = checked_times(times, grid.shape, values=values, expansion=expansion)
-    curves = np.asarray(values, dtype=np.float64)
-    series = None if expansion is None else np.asarray(expansion, dtype=np.float64)
+    curves = np.moveaxis(np.asarray(values, dtype=np.float64), 0, -1)
+    series = None if expansion is None else np.moveaxis(np.asarray(expansion, dtype=np.float64), 0, -1)
     nodes = _nearest_nodes(np.asarray(points, dtype=np.float64), grid)
     if labels is None:
         labels = ["(" + ", ".join(f"{c:.3g}" for c in grid.nodes[node]) + ")" for node in nodes]
     factor = (4 * math.pi * t) ** (grid.dimension / 2) if scaled else np.ones_like(t)
     colours = colormaps[cmap](np.linspace(0.0, 0.85, len(nodes)))
+    ax.set(xscale="log", yscale="linear" if scaled else "log")
     lines = []
     for node, label, colour in zip(nodes, labels, colours, strict=True):
-        history: Any = (slice(None), *node)
-        style = {"color": colour, "label": label, **kwargs}
-        lines += ax.plot(t, factor * curves[history], **style)
-        if series is not None:
-            ax.plot(t, factor * series[history], color=style["color"], linestyle="--", linewidth=1.0)
-    # The curves determine the scale, because the series diverges at large t.
-    drawn = np.concatenate([np.asarray(line.get_ydata()) for line in lines])
-    _logarithmic(ax, "x", t)
-    if scaled:
-        margin = 0.08 * float(np.ptp(drawn)) or 0.1
-        ax.set_ylim(drawn.min() - margin, drawn.max() + margin)
-    else:
-        _logarithmic(ax, "y", drawn)
+        lines += ax.plot(t, factor * curves[node], **{"color": colour, "label": label, **kwargs})
+    limits = ax.get_ylim()  # of the curves, because the series diverges at large t
+    if series is not None:
+        for node, line in zip(nodes, lines, strict=True):
+            ax.plot(t, factor * series[node], color=line.get_color(), linestyle="--", linewidth=1.0)
+    ax.set_ylim(limits)
     ax.set_xlabel(f"$t${' in ' * bool(unit)}{unit}")
     power = {2: r"4\pi t\,", 3: r"(4\pi t)^{3/2}\,"}[grid.dimension] if scaled else ""
     ax.set_ylabel(rf"${power}\mathrm{{HKS}}(t)$")
@@ -109,19 +102,6 @@ def _nearest_nodes(points: np.ndarray, grid: Grid) -> list[tuple[int, ...]]:
         if not (on and grid.inside[tuple(node)]):
             raise ValueError(f"points: got {tuple(point.tolist())} outside the grid or its mask; choose one inside")
     return [tuple(node) for node in index.tolist()]
-
-
-def _logarithmic(ax: Axes, name: str, values: np.ndarray) -> None:
-    """Make an axis logarithmic over the positive values, with few tick labels and a small margin."""
-    positive = values[values > 0]
-    low, high = (float(positive.min()), float(positive.max())) if positive.size else (0.1, 1.0)
-    margin = max(high / low, 1.1) ** 0.04
-    ax.set(**{f"{name}scale": "log", f"{name}lim": (low / margin, high * margin)})
-    axis = ax.xaxis if name == "x" else ax.yaxis
-    if high < 50 * low:
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: number_text(value)))
-    axis.set_minor_formatter(NullFormatter())
 
 
 def spectrum(

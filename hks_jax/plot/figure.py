@@ -1,6 +1,5 @@
 """Figures, axes and colour bars that all plots share."""
 
-import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, Locator, MaxNLocator, ScalarFormatter
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from matplotlib.transforms import ScaledTranslation
 
 from hks_jax.domain.grid import Grid
@@ -152,7 +151,7 @@ def colour_bar_in(
     formatter = ScalarFormatter(useOffset=False, useMathText=True)
     formatter.set_powerlimits((-3, 4))
     if "format" not in kwargs and "ticks" not in kwargs:
-        bar.locator = _colour_ticks(bar)
+        bar.locator = MaxNLocator(5 if bar.orientation == "vertical" else 3, steps=[1, 2, 2.5, 5, 10])
         bar.formatter = formatter
         bar.update_ticks()
     bar_axes.tick_params(labelsize=SMALL)
@@ -161,16 +160,6 @@ def colour_bar_in(
     if label:
         bar.set_label(label, fontsize=SMALL)
     return bar
-
-
-def _colour_ticks(bar: Colorbar) -> Locator:
-    """Return the tick locator of a colour bar, with two ticks below a bar whose numbers have many digits."""
-    low, high = sorted(float(end) for end in bar.mappable.get_clim() if end is not None)
-    largest = max(abs(low), abs(high))
-    step = 10.0 ** math.floor(math.log10(max((high - low) / 5, 1e-300)))
-    if bar.orientation == "vertical" or largest < 1e3 * step:
-        return MaxNLocator(5, steps=[1, 2, 2.5, 5, 10])
-    return FixedLocator([step * round((low + part * (high - low)) / step) for part in (0.22, 0.78)])
 
 
 def number_text(value: float) -> str:

@@ -1,5 +1,6 @@
 """Figures of fits: the metric and its agreement with the signature."""
 
+import itertools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -7,18 +8,19 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Real
 from matplotlib.axes import Axes
+from matplotlib.colors import TABLEAU_COLORS
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator
 
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.plot.figure import SMALL, finished, new_figure, number_text, panel_size, require_plane
 from hks_jax.plot.glyphs import ellipses
-from hks_jax.plot.images import masked, scalar_image, shared_colours
+from hks_jax.plot.images import masked, panel_colours, scalar_image
 from hks_jax.plot.orientation import Orientation
 from hks_jax.plot.panels import checked_times
 
 if TYPE_CHECKING:  # slow to import
-    from hks_jax.inverse.metric_fit import MetricFit, Step
+    from hks_jax.inverse.metric_fit import MetricFit
 
 LEAST_DIFFERENCE = 1e-6
 """The minimum of the colours' range for relative differences; the errors of the eigenpairs are smaller."""
@@ -30,14 +32,14 @@ def fit_panels(
     times: Sequence[float] | Real[ArrayLike, " n_times"] | None = None,
     *,
     max_times: int = 3,
-    title: str | None = None,
+    title: str = "",
     orientation: Orientation | None = None,
 ) -> Figure:
     """Return a figure of a fit in 2D with signatures, the metric and the loss.
 
     A few times, including the first and the last, have a row each. It shows the target, the fitted signature in the
     same colours, and their relative difference in colours that all rows share. Below are the unit circles of the fitted
-    metric and the loss over the steps. Each start has a curve, which is interrupted at a new stage or a resumed fit.
+    metric and the loss over the steps, with a curve for each start.
 
     Args:
         fit: the result of `hks_jax.fit_metric`.
@@ -62,8 +64,6 @@ def fit_panels(
         times = fit.problem.observation.times
     if times is None:
         raise ValueError("times: got None for a fit without times; expected one number per image of the target")
-    if max_times < 1:
-        raise ValueError(f"max_times: got {max_times}; expected at least 1")
     wanted, fitted = np.asarray(target, dtype=np.float64), np.asarray(fit.hks, dtype=np.float64)
     t = checked_times(times, grid.shape, **{"target": wanted, "fit.hks": fitted})
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -86,7 +86,7 @@ def fit_panels(
     for row, index in enumerate(rows):
         pair = masked("target", wanted[index], grid), masked("fit.hks", fitted[index], grid)
         images = {"target": pair[0], "fitted": pair[1], "fitted / target − 1": difference[index]}
-        colours = [shared_colours(pair, {})] * 2 + [{"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}]
+        colours = [*panel_colours(pair, shared=True), {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}]
         for column, (text, values) in enumerate(images.items()):
             ax = figure.add_subplot(panels[row, column])
             scalar_image(ax, values, grid, orientation=orientation, **colours[column])
@@ -101,35 +101,20 @@ def fit_panels(
         orientation.letter(ax)
     ax.set_title("fitted metric, unit circles", fontsize="medium")
     _draw_loss(figure.add_subplot(last[1]), fit)
-    return finished(figure, title or "")
+    return finished(figure, title)
 
 
 def _draw_loss(ax: Axes, fit: "MetricFit") -> None:
-    """Draw the loss over the steps and, if there are penalties, the data's part of the loss."""
+    """Draw the loss over the steps of each start and, if there are penalties, the data's part of the loss."""
     starts = sorted({step.start for step in fit.history})
-    # Each stage, start or resumed fit numbers its steps from 0.
-    pieces: list[list[Step]] = []
-    for step in fit.history:
-        last = pieces[-1][-1] if pieces else None
-        if last is None or step.step <= last.step or (step.start, step.stage) != (last.start, last.stage):
-            pieces.append([])
-        pieces[-1].append(step)
-    offset, before = 0, None
-    for piece in pieces:
-        if before is not None:
-            offset = offset + before.step if before.start == piece[0].start else 0
-        before = piece[-1]
-        steps = [offset + step.step for step in piece]
-        color = f"C{starts.index(before.start) % 10}"
-        first = offset == 0
-        label = "loss" if len(starts) == 1 else f"start {before.start}"
-        ax.plot(steps, [step.loss for step in piece], ".-", color=color, label=label if first else None)
+    for color, start in zip(itertools.cycle(TABLEAU_COLORS), starts, strict=False):
+        steps = [step for step in fit.history if step.start == start]
+        label = "loss" if len(starts) == 1 else f"start {start}"
+        ax.plot([step.loss for step in steps], ".-", color=color, label=label)
         if fit.problem.regularisers:
-            label = "misfit" if before.start == starts[0] else ""
-            ax.plot(steps, [step.misfit for step in piece], ":", color=color, label=label if first and label else None)
+            label = "misfit" if start == starts[0] else ""
+            ax.plot([step.misfit for step in steps], ":", color=color, label=label)
     ax.set_yscale("log", nonpositive="mask")
-    ax.yaxis.set_major_locator(LogLocator(numticks=6))
-    ax.yaxis.set_minor_formatter(NullFormatter())
     ax.xaxis.set_major_locator(MaxNLocator(8, integer=True))
     ax.tick_params(labelsize=SMALL)
     ax.grid(alpha=0.3)

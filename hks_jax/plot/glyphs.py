@@ -18,6 +18,9 @@ from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.plot.figure import cell_extent, colour_bar, frame, legend_below, require_plane, side_in_inches
 
+FILL = 0.92
+"""The size of the largest ellipse or cross relative to its cell; at most 1, because larger ones overlap."""
+
 
 def ellipses(
     ax: Axes,
@@ -28,7 +31,6 @@ def ellipses(
     sizes: Literal["common", "fit"] = "common",
     color: str = "anisotropy",
     cmap: str | None = None,
-    fill: float = 0.92,
     colorbar: bool = True,
     **kwargs: Any,
 ) -> EllipseCollection:
@@ -45,7 +47,6 @@ def ellipses(
         sizes: ``"common"`` uses one scale, so that sizes are comparable; ``"fit"`` fills each cell with its ellipse.
         color: ``"anisotropy"`` (λ₁ − λ₂)/(λ₁ + λ₂), ``"orientation"`` of the longer axis in degrees, or a colour.
         cmap: the colour map, by default viridis for anisotropy and the cyclic twilight for orientation.
-        fill: the relative size of the largest ellipse in its cell, at most 1.
         colorbar: whether to add a colour bar.
         **kwargs: arguments of `matplotlib.collections.EllipseCollection`.
 
@@ -63,8 +64,6 @@ def ellipses(
         raise ValueError(f'kind: got {kind!r}; expected "metric" or "tensor"')
     if sizes not in ("common", "fit"):
         raise ValueError(f'sizes: got {sizes!r}; expected "common" or "fit"')
-    if not 0 < fill <= 1:
-        raise ValueError(f"fill: got {fill}; expected a number in (0, 1], because larger ellipses overlap")
     steps, pick = nodes_drawn(grid, every, ax)
     inside = grid.inside[pick]
     if not inside.any():
@@ -79,7 +78,7 @@ def ellipses(
     axis = vectors[:, :, longer]
     # The bounding box of the ellipse has the half sides √((T^±1)_aa).
     box = np.sqrt(np.einsum("nai,ni->na", vectors**2, half_axes**2))
-    scale = 0.5 * fill / np.max(box / (np.array(steps) * grid.spacing), axis=1)
+    scale = 0.5 * FILL / np.max(box / (np.array(steps) * grid.spacing), axis=1)
     if sizes == "common":
         scale[:] = scale.min()
     half_axes *= scale[:, None]
@@ -138,7 +137,6 @@ def sensitivity(
     *,
     power: float = 0.5,
     colors: tuple[str, str] = ("#b2182b", "#2166ac"),
-    fill: float = 0.95,
     legend: bool = True,
     **kwargs: Any,
 ) -> LineCollection:
@@ -155,7 +153,6 @@ def sensitivity(
             side. The gradient belongs to the drawn nodes, not to the area around them.
         power: an exponent; values below 1 make small derivatives visible beside large ones.
         colors: the colours of positive and negative eigenvalues.
-        fill: the relative length of the longest bar in its cell.
         legend: whether to add a legend of the colours.
         **kwargs: arguments of `matplotlib.collections.LineCollection`.
 
@@ -176,14 +173,11 @@ def sensitivity(
     inside = grid.inside[pick]
     matrices, centres = array[pick][inside], grid.nodes[pick][inside]
     if not np.isfinite(matrices).all():
-        bad = int((~np.isfinite(matrices)).any(axis=(1, 2)).sum())
-        raise ValueError(
-            f"gradient: got {bad} NaN or infinite tensors of {len(matrices)} drawn; expected finite tensors"
-        )
+        raise ValueError("gradient: got NaN or infinite tensors at drawn nodes; expected finite tensors")
     eigenvalues, vectors = np.linalg.eigh((matrices + np.swapaxes(matrices, 1, 2)) / 2)
     lengths = np.abs(eigenvalues) ** power
     cell = min(s * h for s, h in zip(steps, grid.spacing, strict=True))
-    lengths *= 0.5 * fill * cell / max(lengths.max(initial=0.0), np.finfo(float).tiny)
+    lengths *= 0.5 * FILL * cell / max(lengths.max(initial=0.0), np.finfo(float).tiny)
     ends = np.einsum("nai,ni->nia", vectors, lengths)
     bars = np.stack([centres[:, None] - ends, centres[:, None] + ends], axis=2).reshape(-1, 2, 2)
     chosen = np.where(eigenvalues.ravel() > 0, colors[0], colors[1])

@@ -16,6 +16,10 @@ from hks_jax.plot.orientation import Orientation
 
 FADED = 2.0
 """The number of standard deviations above which values are not faded as noise."""
+FAR = 1.5
+"""The least ratio of a median to a centre for which the values are far from the centre."""
+RULES = ("quantiles", "least_range", "centre", "vmin", "vmax")
+"""The arguments of `scalar_image` that determine the values of the first and the last colour."""
 
 
 def scalar_image(
@@ -45,8 +49,8 @@ def scalar_image(
         vmin: the value of the first colour, by default from `quantiles`.
         vmax: the value of the last colour, by default from `quantiles`.
         centre: the value of the middle colour unless vmin and vmax are given, such as 1 for 4πt·HKS, its value for a
-            flat metric. The colours reach equally far above and below. For values ≥ 0 they reach down to 0 at most;
-            there is no centre if most values would then have one of the last colours.
+            flat metric. The colours reach equally far above and below, for values ≥ 0 down to 0 at most. There is no
+            centre if most values are ≥ 0 and far above it.
         quantiles: the quantiles of the values with the first and the last colour, unless vmin and vmax are given. The
             colour bar has arrows if values lie beyond.
         least_range: the least difference of the values of the last and the first colour, relative to the larger. It
@@ -73,7 +77,7 @@ def scalar_image(
         array = orientation.array(array)
         opacity = None if opacity is None else orientation.array(opacity)
         grid = orientation.grid(grid)
-    low, high, own = colours_of(array.compressed(), quantiles, least_range, centre, vmin, vmax)
+    ((low, high, own),) = colours_of([array.compressed()], quantiles, least_range, centre, vmin, vmax)
     image = ax.imshow(
         array.T,
         origin="lower",
@@ -100,8 +104,6 @@ def influence_map(
     grid: Grid,
     *,
     levels: Sequence[float] = (0.01, 0.1),
-    cmap: str | Colormap = "cividis",
-    label: str = "boundary's influence",
     **kwargs: Any,
 ) -> AxesImage:
     """Draw the share of the HKS that is due to the boundary at one time, with contour lines.
@@ -111,12 +113,7 @@ def influence_map(
         influence: (*shape) the result of `hks_jax.boundary_influence` at one time.
         grid: the 2D grid of the values.
         levels: the levels of the contour lines, ascending between 0 and 1.
-        cmap: the colour map from 0 to 1.
-        label: the colour bar's label.
         **kwargs: arguments of `scalar_image`.
-
-    Returns:
-        The image.
 
     Raises:
         ValueError: if the grid is 3D, or if the values have another shape.
@@ -127,9 +124,9 @@ def influence_map(
         (0.0, 1.0)
     """
     values = masked("influence", influence, grid)
-    image = scalar_image(ax, values, grid, cmap=cmap, vmin=0.0, vmax=1.0, label=label, **kwargs)
-    reached = [level for level in levels if values.min() < level < values.max()]
-    if reached:
+    style = {"cmap": "cividis", "vmin": 0.0, "vmax": 1.0, "label": "boundary's influence", **kwargs}
+    image = scalar_image(ax, values, grid, **style)
+    if reached := [level for level in levels if values.min() < level < values.max()]:
         lines = ax.contour(*grid.axes, values.T, levels=reached, colors="white", linewidths=1.0)
         ax.clabel(lines, fmt=lambda level: f"{100 * level:g} %", fontsize="x-small")
     return image
@@ -157,30 +154,48 @@ class Colours(NamedTuple):
 
 
 def colours_of(
-    values: np.ndarray,
+    images: Sequence[np.ndarray],
     quantiles: tuple[float, float] = (0.0, 1.0),
     least_range: float = 1e-6,
     centre: float | None = None,
     vmin: float | None = None,
     vmax: float | None = None,
-) -> Colours:
-    """Return the colours of values by the rules of `scalar_image`."""
-    low, high = (float(q) for q in np.quantile(values, quantiles))
-    cmap = "viridis"
-    if centre is not None:
-        reach = max(high - centre, centre - low, 0.0)
-        if values.min() >= 0 < centre < reach:  # no colours for negative values
-            reach = centre if np.median(values) <= 1.5 * centre else 0.0
-        if reach or low == high:
-            low, high, cmap = centre - reach, centre + reach, "RdBu_r"
-    lacking = least_range * (max(abs(low), abs(high)) or 1.0) - (high - low)
-    low, high = low - max(lacking, 0) / 2, high + max(lacking, 0) / 2
-    return Colours(low if vmin is None else vmin, high if vmax is None else vmax, cmap)
+) -> list[Colours]:
+    """Return the colours of each image by the rules of `scalar_image`, with one colour map for all images."""
+    everything = np.concatenate([image.ravel() for image in images])
+    if centre is not None and everything.min() >= 0 and np.median(everything) > FAR * centre > 0:
+        centre = None
+    colours = []
+    for values in images:
+        low, high = (float(q) for q in np.quantile(values, quantiles))
+        if centre is not None:
+            reach = max(high - centre, centre - low)
+            if values.min() >= 0 < centre and np.median(values) <= FAR * centre:
+                reach = min(reach, centre)  # no colours for negative values
+            low, high = centre - reach, centre + reach
+        lacking = least_range * (max(abs(low), abs(high)) or 1.0) - (high - low)
+        low, high = low - max(lacking, 0) / 2, high + max(lacking, 0) / 2
+        cmap = "viridis" if centre is None else "RdBu_r"
+        colours.append(Colours(low if vmin is None else vmin, high if vmax is None else vmax, cmap))
+    return colours
 
 
-def shared_colours(images: Sequence[np.ma.MaskedArray], kwargs: dict[str, Any]) -> dict[str, Any]:
-    """Return arguments of `scalar_image` with which all these images share one colour scale."""
-    values = np.concatenate([image.compressed() for image in images])
-    names = ("quantiles", "least_range", "centre", "vmin", "vmax")
-    low, high, own = colours_of(values, **{name: kwargs[name] for name in names if name in kwargs})
-    return {**kwargs, "vmin": low, "vmax": high, "cmap": kwargs.get("cmap") or own}
+def panel_colours(
+    images: Sequence[np.ma.MaskedArray],
+    limits: Sequence[tuple[float, float]] | None = None,
+    shared: bool = False,
+    **kwargs: Any,
+) -> list[dict[str, Any]]:
+    """Return the arguments of `scalar_image` for each image, given those for all images.
+
+    Either `limits` contains the values of the first and the last colour for each image, or they follow from the values,
+    of all images together if `shared` is set.
+    """
+    rules = {name: kwargs.pop(name) for name in RULES if name in kwargs}
+    if limits is not None:
+        if len(limits) != len(images):
+            raise ValueError(f"limits: got {len(limits)}; expected {len(images)}, one pair per time")
+        return [{**kwargs, "vmin": low, "vmax": high} for low, high in limits]
+    values = [image.compressed() for image in images]
+    colours = colours_of([np.concatenate(values)], **rules) * len(values) if shared else colours_of(values, **rules)
+    return [{"cmap": own.cmap, **kwargs, "vmin": own.low, "vmax": own.high} for own in colours]

@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float, Real
-from matplotlib.axes import Axes
 from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 
 from hks_jax.domain.grid import Grid
 from hks_jax.plot.figure import SMALL, finished, new_figure, number_text, panel_size, require_plane
-from hks_jax.plot.images import masked, scalar_image, shared_colours
+from hks_jax.plot.images import masked, panel_colours, scalar_image
 from hks_jax.plot.orientation import Orientation
 
 
@@ -26,6 +25,7 @@ def hks_panels(
     titles: Sequence[str] | None = None,
     unit: str = "",
     shared_range: bool = False,
+    limits: Sequence[tuple[float, float]] | None = None,
     path: str | os.PathLike[str] | None = None,
     suptitle: str = "",
     orientation: Orientation | None = None,
@@ -41,6 +41,7 @@ def hks_panels(
         titles: a title for each time, by default “t = …”.
         unit: the unit of t, which follows its value.
         shared_range: whether all images use the colours of one range.
+        limits: the values of the first and the last colour for each time.
         path: the file in which to save the figure, if given.
         suptitle: the figure's title.
         orientation: the same as for `scalar_image`.
@@ -60,26 +61,20 @@ def hks_panels(
     t = checked_times(times, grid.shape, values=values)
     titles = panel_titles(t, titles, unit)
     images = [masked("values", v, grid) for v in np.asarray(values)]
-    if shared_range:
-        kwargs = shared_colours(images, kwargs)
-
-    rows, columns = _layout(t.size)
+    colours = panel_colours(images, limits, shared_range, **kwargs)
+    rows = math.ceil(t.size / 4)
+    columns = math.ceil(t.size / rows)
     width, height = panel_size(grid if orientation is None else orientation.grid(grid), 2.6, 5.0)
     fig = new_figure(columns * (width + 1.0) + 0.4, rows * (height + 0.45) + 0.3 + 0.3 * bool(suptitle))
     noise = [None] * t.size if z is None else np.asarray(z)
-    for index, ax in enumerate(axes_in_rows(fig, t.size, columns)):
-        scalar_image(ax, images[index], grid, orientation=orientation, z=noise[index], **kwargs)
+    panels = fig.subplots(rows, columns, squeeze=False).ravel()
+    for ax in panels[t.size :]:
+        ax.remove()
+    for index, ax in enumerate(panels[: t.size]):
+        scalar_image(ax, images[index], grid, orientation=orientation, z=noise[index], **colours[index])
         ax.set_title(titles[index], fontsize="medium")
         ax.tick_params(labelleft=index % columns == 0, labelbottom=index + columns >= t.size)
     return finished(fig, suptitle, path)
-
-
-def axes_in_rows(figure: Figure, count: int, columns: int) -> list[Axes]:
-    """Return a given number of axes of a figure in rows, which are full except for the last."""
-    panels = figure.subplots(math.ceil(count / columns), columns, squeeze=False).ravel().tolist()
-    for ax in panels[count:]:
-        ax.remove()
-    return panels[:count]
 
 
 def time_rows(
@@ -88,7 +83,7 @@ def time_rows(
     grid: Grid,
     *,
     unit: str = "",
-    shared: str = "none",
+    shared_range: bool = False,
     cmap: str | Colormap | Mapping[str, str] = "viridis",
     quantiles: tuple[float, float] = (0.0, 1.0),
     suptitle: str = "",
@@ -100,13 +95,13 @@ def time_rows(
         times: (n_times,).
         grid: the 2D grid of the values.
         unit: the unit of t.
-        shared: the images that share one range of colours: ``"none"``, or those of each ``"row"``.
+        shared_range: whether the images of a row use the colours of one range.
         cmap: a colour map, or one for each row by name.
         quantiles: the same as for `scalar_image`.
         suptitle: the figure's title.
 
     Raises:
-        ValueError: if there are no rows or times, if values are not one image per time, or if `shared` is unknown.
+        ValueError: if there are no rows or times, or if values are not one image per time.
 
     Examples:
         >>> fig = hj.plot.time_rows({"HKS": hj.hks(pairs, [0.2, 0.5])}, [0.2, 0.5], field.grid)
@@ -114,8 +109,6 @@ def time_rows(
         2
     """
     require_plane("grid", grid)
-    if shared not in ("none", "row"):
-        raise ValueError(f'shared: got {shared!r}; expected "none" or "row"')
     if not rows:
         raise ValueError("rows: got no scalars; expected at least one")
     t = checked_times(times, grid.shape, **{f"rows: {name}": values for name, values in rows.items()})
@@ -124,11 +117,10 @@ def time_rows(
     panels = figure.subplots(len(rows), t.size, squeeze=False)
     for line, (name, values) in zip(panels, rows.items(), strict=True):
         images = [masked(f"rows: {name}", each, grid) for each in np.asarray(values)]
-        colours: dict[str, Any] = {"cmap": cmap[name] if isinstance(cmap, Mapping) else cmap, "quantiles": quantiles}
-        if shared == "row":
-            colours = shared_colours(images, colours)
-        for ax, image in zip(line, images, strict=True):
-            scalar_image(ax, image, grid, **colours)
+        own = cmap[name] if isinstance(cmap, Mapping) else cmap
+        colours = panel_colours(images, shared=shared_range, cmap=own, quantiles=quantiles)
+        for ax, image, style in zip(line, images, colours, strict=True):
+            scalar_image(ax, image, grid, **style)
             ax.set(xticks=[], yticks=[])
         line[0].set_ylabel(name, fontsize=SMALL)
     for ax, title in zip(panels[0], panel_titles(t, None, unit), strict=True):
@@ -155,11 +147,3 @@ def panel_titles(t: Float[np.ndarray, " n_times"], titles: Sequence[str] | None,
     if len(titles) != t.size:
         raise ValueError(f"titles: got {len(titles)}; expected {t.size}, one per time")
     return titles
-
-
-def _layout(n: int) -> tuple[int, int]:
-    """Return the numbers of rows and columns for n panels, with at most four per row and evenly filled rows."""
-    if n <= 4:
-        return 1, n
-    columns = min(range(3, 6), key=lambda c: (-n % c, math.ceil(n / c)))
-    return math.ceil(n / columns), columns

@@ -23,6 +23,9 @@ from hks_jax.plot.figure import inches
 from hks_jax.plot.images import colours_of, masked
 from hks_jax.plot.volumes import require_volume
 
+LIGHT = (0.3, -0.5, 0.8)
+"""The direction towards the light."""
+
 
 def surface(
     ax: Axes3D,
@@ -33,7 +36,6 @@ def surface(
     vmin: float | None = None,
     vmax: float | None = None,
     relief: float = 0.35,
-    light: tuple[float, float, float] = (0.3, -0.5, 0.8),
     zoom: float = 1.25,
     **kwargs: Any,
 ) -> ScalarMappable:
@@ -49,7 +51,6 @@ def surface(
         vmin: the value of the first colour, by default the least value.
         vmax: the value of the last colour, by default the greatest value.
         relief: the strength of the shading between 0 and 1, where 0 means no shading.
-        light: the direction towards the light.
         zoom: the size of the surface in its axes.
         **kwargs: arguments of `Poly3DCollection`.
 
@@ -72,9 +73,8 @@ def surface(
     corners = vertices[mesh.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    direction = np.asarray(light) / np.linalg.norm(light)
     # The absolute value |n·l| makes the orientation of triangles irrelevant.
-    brightness = 1 - relief * (1 - np.abs(normals @ direction))
+    brightness = 1 - relief * (1 - np.abs(normals @ LIGHT) / np.linalg.norm(LIGHT))
 
     mappable = ScalarMappable(Normalize(vmin, vmax), colormaps[cmap])
     mappable.set_array(scalars)
@@ -143,7 +143,7 @@ def isosurfaces(
     """
     require_volume(grid)
     array = masked("values", values, grid)
-    low, high, _ = colours_of(array.compressed(), quantiles, vmin=vmin, vmax=vmax)
+    ((low, high, _),) = colours_of([array.compressed()], quantiles, vmin=vmin, vmax=vmax)
     heights = np.linspace(low, high, levels + 2)[1:-1] if isinstance(levels, int) else np.asarray(levels, np.float64)
     if heights.ndim != 1 or not heights.size or not np.isfinite(heights).all():
         raise ValueError(f"levels: got {levels}; expected a number of at least 1, or finite values")
@@ -156,7 +156,10 @@ def isosurfaces(
         size = tuple(max(round(resolution * side), 64) for side in inches(ax))
         plotter = pyvista.Plotter(off_screen=True, window_size=size)
         try:
-            domain = _domain(pyvista, array, grid)
+            cells = pyvista.ImageData(dimensions=grid.shape, spacing=grid.spacing, origin=grid.origin)
+            cells.point_data["values"] = array.filled(0.0).ravel(order="F")  # VTK stores the first axis contiguously
+            complete = active_elements(~np.ma.getmaskarray(array), (False,) * 3)
+            domain = cells.extract_cells(np.flatnonzero(complete.ravel(order="F")))
             surfaces = domain.contour(heights, scalars="values")
             if surfaces.n_points:
                 style = {"ambient": 0.3, "specular": 0.2, "smooth_shading": True, "show_scalar_bar": False}
@@ -180,14 +183,6 @@ def isosurfaces(
     mappable = ScalarMappable(Normalize(low, high), cmap)
     mappable.set_array(array.compressed())
     return mappable
-
-
-def _domain(pyvista: ModuleType, array: np.ma.MaskedArray, grid: Grid) -> Any:
-    """Return the elements whose nodes all have a value, with the values at their points."""
-    image = pyvista.ImageData(dimensions=grid.shape, spacing=grid.spacing, origin=grid.origin)
-    image.point_data["values"] = array.filled(0.0).ravel(order="F")  # VTK stores the first axis contiguously
-    inside = active_elements(~np.ma.getmaskarray(array), (False,) * 3)
-    return image.extract_cells(np.flatnonzero(inside.ravel(order="F")))
 
 
 def _rim(pyvista: ModuleType, domain: Any) -> Any:

@@ -99,9 +99,6 @@ def evenly_spaced_lines(
     which: Which = "major",
     *,
     separation: float,
-    step: float | None = None,
-    max_length: float | None = None,
-    least_length: float | None = None,
 ) -> list[Float[np.ndarray, "m 2"]]:
     """Return integral lines that fill the domain with a distance of about `separation`, in coordinates.
 
@@ -112,10 +109,8 @@ def evenly_spaced_lines(
     Args:
         field: a 2D field.
         which: ``"major"`` or ``"minor"``.
-        separation: the distance between neighbouring lines where they start.
-        step: the same as for `trace`.
-        max_length: the same as for `trace`.
-        least_length: the length below which lines are omitted, by default twice the separation.
+        separation: the distance between neighbouring lines where they start. Lines shorter than twice the
+            separation are omitted.
 
     Examples:
         >>> lines = hj.plot.evenly_spaced_lines(field, separation=0.2)
@@ -124,12 +119,10 @@ def evenly_spaced_lines(
     """
     if not separation > 0:
         raise ValueError(f"separation: got {separation}; expected a positive length, in the unit of the coordinates")
-    h, n_steps = _lengths(field, step, max_length)
+    h, n_steps = _lengths(field, None, None)
     h = min(h, separation / 4)
     seeds = _candidates(field, separation / 2)
     forward, backward = _both_ways(DirectionField(field, which), seeds, h, n_steps)
-    least = 2 * separation if least_length is None else least_length
-
     lines: list[np.ndarray] = []
     tree: cKDTree | None = None
     centre = np.array([0.5 * (a[0] + a[-1]) for a in field.grid.axes])
@@ -143,7 +136,7 @@ def evenly_spaced_lines(
         index = int(np.argmin(np.where(allowed, distance, np.inf)))
         free[index] = False
         line = _grow(forward[index], backward[index], tree, separation / 2, h)
-        if (len(line) - 1) * h < least:
+        if (len(line) - 1) * h < 2 * separation:
             continue
         if not lines:
             distance[:] = np.inf
@@ -237,8 +230,6 @@ def integral_lines(
     *,
     seeds: Float[np.ndarray, "n 2"] | None = None,
     density: float = 1.0,
-    step: float | None = None,
-    max_length: float | None = None,
     **kwargs: Any,
 ) -> LineCollection:
     """Draw integral lines of an eigenvector field on `ax`.
@@ -250,8 +241,6 @@ def integral_lines(
         seeds: (n, 2) points on the lines, by default the seeds of evenly spaced lines.
         density: the density of evenly spaced lines. At 1 their distance is 1/25 of the longer side or, on small axes,
             more.
-        step: the arc length of an integration step, by default half the smaller grid spacing.
-        max_length: the maximum arc length of a line, by default eight times the longer side.
         **kwargs: arguments of `matplotlib.collections.LineCollection` (``colors``, ``linewidths``, ``alpha``).
 
     Raises:
@@ -270,9 +259,9 @@ def integral_lines(
         x0, x1, y0, y1 = field.grid.extent
         side = max(x1 - x0, y1 - y0)
         gaps = min(25.0, max(4.0, 11 * side_in_inches(ax, (x1 - x0, y1 - y0))))
-        lines = evenly_spaced_lines(field, which, separation=side / (gaps * density), step=step, max_length=max_length)
+        lines = evenly_spaced_lines(field, which, separation=side / (gaps * density))
     else:
-        lines = [line for line in trace(field, seeds, which, step=step, max_length=max_length) if len(line) > 1]
+        lines = [line for line in trace(field, seeds, which) if len(line) > 1]
     collection = LineCollection(lines, **{"colors": "black", "linewidths": 0.7, "capstyle": "round", **kwargs})
     frame(ax, field.grid)
     ax.add_collection(collection, autolim=False)

@@ -9,13 +9,12 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Real
 from matplotlib.axes import Axes
-from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from hks_jax.domain.grid import Grid
 from hks_jax.plot.figure import SMALL, colour_bar_in, finished, new_figure
-from hks_jax.plot.images import colours_of, masked, scalar_image, shared_colours
+from hks_jax.plot.images import masked, panel_colours, scalar_image
 from hks_jax.plot.orientation import Orientation
 from hks_jax.plot.panels import checked_times, panel_titles
 
@@ -26,7 +25,7 @@ _COLUMN, _COLUMNS = 2.3, 6
 """The width of a column of slices in inches, and the maximum number of columns."""
 
 
-def middle_node(inside: Bool[np.ndarray, "nx ny nz"]) -> tuple[int, int, int]:
+def middle_node(inside: Bool[np.ndarray, "*shape"]) -> tuple[int, ...]:
     """Return the inside node that is nearest to the mean of all inside nodes.
 
     Raises:
@@ -52,6 +51,7 @@ def orthogonal_slices(
     node: Sequence[int] | None = None,
     cross: bool = True,
     orientation: Orientation | None = None,
+    z: Real[ArrayLike, "nx ny nz"] | None = None,
     **kwargs: Any,
 ) -> AxesImage:
     """Draw the slices xy, xz and yz of a volume through a node in the same colours, and return the last image.
@@ -60,15 +60,17 @@ def orthogonal_slices(
         axes: three axes, for the planes xy, xz and yz in this order.
         values: (*shape,), with NaN at nodes without a value.
         grid: the 3D grid of the values, whose spacing determines the aspect.
-        node: the indices (i, j, k) of the node, by default `middle_node` of the finite values.
+        node: the indices (i, j, k) of the node, or else of the nearest node with a value; by default `middle_node` of
+            the finite values.
         cross: whether thin lines show the positions of the other two slices.
         orientation: the orientation of the grid in space, which turns the slices and adds space coordinates and
             letters.
+        z: (*shape,), by which values within the noise fade as in `scalar_image`.
         **kwargs: arguments of `scalar_image` for the whole volume, such as cmap, vmin, vmax, centre, quantiles.
 
     Raises:
-        ValueError: if there are not three axes, if the grid is not 3D, if the values have another shape or none is
-            finite, or if the node is out of range or has no value.
+        ValueError: if there are not three axes, if the grid is not 3D, or if the values have another shape or none is
+            finite.
 
     Examples:
         >>> axes, grid = hj.plot.new_figure(6, 2).subplots(1, 3), hj.Grid((5, 5, 5))
@@ -78,35 +80,23 @@ def orthogonal_slices(
     if len(axes) != 3:
         raise ValueError(f"axes: got {len(axes)}; expected 3, for the planes xy, xz and yz")
     require_volume(grid)
-    array, grid, node = _turned(masked("values", values, grid), grid, node, orientation)
-    kwargs = shared_colours([array], kwargs)
-    return _slices(axes, array, grid, node, orientation, cross=cross, **kwargs)
-
-
-def _slices(
-    axes: Sequence[Axes] | np.ndarray,
-    array: np.ma.MaskedArray,
-    grid: Grid,
-    chosen: tuple[int, ...],
-    orientation: Orientation | None,
-    *,
-    cross: bool = True,
-    z: np.ma.MaskedArray | None = None,
-    **kwargs: Any,
-) -> AxesImage:
-    """Draw the slices of values that are already turned, and return the last image."""
+    noise = None if z is None else masked("z", z, grid)
+    if noise is not None and orientation is not None:
+        noise = orientation.array(noise)
+    array, grid, chosen = _turned(masked("values", values, grid), grid, node, orientation)
+    (style,) = panel_colours([array], **kwargs)
     for ax, (first, second) in zip(axes, PLANES, strict=True):
         normal = 3 - first - second
         plane = (np.take(of, (first, second)).tolist() for of in (grid.shape, grid.spacing, grid.origin))
         slab = np.take(array, chosen[normal], axis=normal)
-        faded = None if z is None else np.take(z, chosen[normal], axis=normal)
-        image = scalar_image(ax, slab, Grid(*plane), colorbar=False, z=faded, **kwargs)
+        faded = None if noise is None else np.take(noise, chosen[normal], axis=normal)
+        image = scalar_image(ax, slab, Grid(*plane), colorbar=False, z=faded, **style)
         if orientation is not None:
             orientation.letter(ax, (first, second))
         if cross:
-            style: dict[str, Any] = {"color": "0.5", "linewidth": 0.6, "linestyle": (0, (4, 3))}
-            ax.axvline(grid.axes[first][chosen[first]], **style)
-            ax.axhline(grid.axes[second][chosen[second]], **style)
+            lines: dict[str, Any] = {"color": "0.5", "linewidth": 0.6, "linestyle": (0, (4, 3))}
+            ax.axvline(grid.axes[first][chosen[first]], **lines)
+            ax.axhline(grid.axes[second][chosen[second]], **lines)
     return image
 
 
@@ -121,12 +111,11 @@ def volume_panels(
     length_unit: str = "",
     limits: Sequence[tuple[float, float]] | None = None,
     path: str | os.PathLike[str] | None = None,
-    cmap: str | Colormap | Sequence[str] = "viridis",
-    quantiles: tuple[float, float] = (0.0, 1.0),
     label: str = "",
     suptitle: str = "",
     orientation: Orientation | None = None,
     z: Real[ArrayLike, "n_times nx ny nz"] | None = None,
+    **kwargs: Any,
 ) -> Figure:
     """Return a figure with a column of three orthogonal slices of the HKS and a colour bar for each time.
 
@@ -134,18 +123,17 @@ def volume_panels(
         values: (n_times, *shape) the result of `hks_jax.hks`.
         times: (n_times,).
         grid: the 3D grid of the values.
-        node: the indices (i, j, k) of a node on the slices, by default `middle_node` of the finite values.
+        node: the same as for `orthogonal_slices`.
         titles: a title for each time, by default “t = …”.
         unit: the unit of t, which follows its value.
         length_unit: the unit of the coordinates.
-        limits: the values of the first and the last colour for each time, by default from `quantiles`.
+        limits: the values of the first and the last colour for each time.
         path: the file in which to save the figure, if given.
-        cmap: a colour map, or one per time.
-        quantiles: the quantiles of each volume with the first and the last colour.
         label: the colour bars' label.
         suptitle: the figure's title.
         orientation: the same as for `orthogonal_slices`.
         z: (n_times, *shape), by which values within the noise fade as in `hks_panels`.
+        **kwargs: arguments of `scalar_image` for all volumes, such as cmap, centre and quantiles.
 
     Raises:
         ValueError: if shapes disagree or there is no time, or as in `orthogonal_slices`.
@@ -160,22 +148,15 @@ def volume_panels(
     t = checked_times(times, grid.shape, values=values)
     titles = panel_titles(t, titles, unit)
     volumes = [masked("values", each, grid) for each in np.asarray(values)]
-    noise = [None] * t.size if z is None else [masked("z", each, grid) for each in np.asarray(z)]
-    if limits is None:
-        limits = [colours_of(volume.compressed(), quantiles)[:2] for volume in volumes]
-    elif len(limits) != t.size:
-        raise ValueError(f"limits: got {len(limits)}; expected {t.size}, one pair per time")
-    cmaps = [cmap] * t.size if isinstance(cmap, str | Colormap) else list(cmap)
-    if len(cmaps) != t.size:
-        raise ValueError(f"cmap: got {len(cmaps)}; expected {t.size}, one per time")
+    noise = [None] * t.size if z is None else np.asarray(z)
+    colours = panel_colours(volumes, limits, **kwargs)
     _, shown, chosen = _turned(volumes[0], grid, node, orientation)
-    if orientation is not None:
-        volumes = [orientation.array(volume) for volume in volumes]
-        noise = [None if each is None else orientation.array(each) for each in noise]
 
     rows = math.ceil(t.size / _COLUMNS)
     columns = math.ceil(t.size / rows)
-    heights = _heights(shown)
+    sizes = np.multiply(shown.shape, shown.spacing)
+    heights = [float(np.clip(_COLUMN * sizes[up] / max(sizes[:2]), 0.25, 3 * _COLUMN)) for _, up in PLANES]
+    coordinates = [f"{name} ({length_unit})" if length_unit else name for name in AXES]
     fig = new_figure(
         columns * (_COLUMN + 0.2) + 0.6, rows * (sum(heights) + 1.35 + 0.15 * bool(label)) + 0.3 * bool(suptitle)
     )
@@ -188,42 +169,17 @@ def volume_panels(
                 for ax in panels[:, column]:
                     ax.remove()
                 continue
-            low, high = limits[index]
-            image = _slices(
-                panels[:3, column],
-                volumes[index],
-                shown,
-                chosen,
-                orientation,
-                z=noise[index],
-                cmap=cmaps[index],
-                vmin=low,
-                vmax=high,
-            )
+            style = {"node": node, "orientation": orientation, "z": noise[index], **colours[index]}
+            image = orthogonal_slices(panels[:3, column], volumes[index], grid, **style)
             panels[0, column].set_title(titles[index], fontsize="medium")
-            _label_slices(panels[:3, column], shown, chosen, length_unit, leftmost=column == 0)
+            for ax, (first, second) in zip(panels[:3, column], PLANES, strict=True):
+                normal = 3 - first - second
+                place = f"{AXES[normal]} = {shown.axes[normal][chosen[normal]]:.4g} {length_unit}".rstrip()
+                ax.set_xlabel(coordinates[first], fontsize=SMALL, labelpad=1)
+                ax.set_ylabel(f"{place}\n{coordinates[second]}" if column == 0 else "", fontsize=SMALL)
+                ax.tick_params(labelleft=column == 0)
             colour_bar_in(panels[3, column], image, label, values=volumes[index], orientation="horizontal")
     return finished(fig, suptitle, path)
-
-
-def _label_slices(
-    axes: Sequence[Axes] | np.ndarray, grid: Grid, node: tuple[int, ...], unit: str, leftmost: bool
-) -> None:
-    suffix = f" ({unit})" if unit else ""
-    for ax, (first, second) in zip(axes, PLANES, strict=True):
-        ax.set_xlabel(AXES[first] + suffix, fontsize=SMALL, labelpad=1)
-        ax.tick_params(labelleft=leftmost)
-        if leftmost:
-            normal = 3 - first - second
-            place = f"{AXES[normal]} = {grid.axes[normal][node[normal]]:.4g} {unit}".rstrip()
-            ax.set_ylabel(f"{place}\n{AXES[second]}{suffix}", fontsize=SMALL)
-
-
-def _heights(grid: Grid) -> list[float]:
-    """Return the slices' heights in inches if the widest slice has the width of a column."""
-    sizes = [n * h for n, h in zip(grid.shape, grid.spacing, strict=True)]
-    scale = _COLUMN / max(sizes[0], sizes[1])
-    return [min(max(scale * sizes[second], 0.25), 3 * _COLUMN) for _, second in PLANES]
 
 
 def require_volume(grid: Grid) -> None:
@@ -235,17 +191,12 @@ def require_volume(grid: Grid) -> None:
 def _turned(
     array: np.ma.MaskedArray, grid: Grid, node: Sequence[int] | None, orientation: Orientation | None
 ) -> tuple[np.ma.MaskedArray, Grid, tuple[int, ...]]:
-    """Return values, grid and node in the order of the image; raise ValueError if the node has no value."""
+    """Return values, grid and node, or the nearest node with a value, in the order of the image."""
     if node is not None:
-        inside, node = ~np.ma.getmaskarray(array), tuple(int(i) for i in node)
-        if len(node) != 3 or not all(0 <= i < n for i, n in zip(node, grid.shape, strict=True)):
-            raise ValueError(f"node: got {node}; expected three indices within the grid's shape {grid.shape}")
-        if not inside[node]:
-            raise ValueError(
-                f"node: got {node}, which has no value; expected a node with a value, such as {middle_node(inside)}"
-            )
+        nodes = np.argwhere(~np.ma.getmaskarray(array))
+        node = nodes[np.argmin(np.sum((nodes - np.asarray(node)) ** 2, axis=1))].tolist()
     if orientation is not None:
         node = None if node is None else orientation.node(node, grid.shape)
         array, grid = orientation.array(array), orientation.grid(grid)
     # The middle is determined in the image, so that ties do not depend on the storage order.
-    return array, grid, middle_node(~np.ma.getmaskarray(array)) if node is None else node
+    return array, grid, middle_node(~np.ma.getmaskarray(array)) if node is None else tuple(node)

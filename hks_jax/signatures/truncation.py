@@ -14,7 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.arrays import nan_is_meant
+from hks_jax.arrays import describe_array, nan_is_meant
 from hks_jax.compilation import numpy_where_known
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.space import mask_for
@@ -50,6 +50,13 @@ class Truncation(eqx.Module):
     coarse_fraction: Float[Array, " n"]
     smallest_time: Float[Array, ""]
     order: int = eqx.field(static=True, default=1, kw_only=True)
+
+    def __repr__(self) -> str:
+        if is_traced(self) or not isinstance(self.tail, jax.Array | np.ndarray):
+            return f"Truncation(times={describe_array(self.times)})"
+        names = ("tail", "resolution_bias", "smallest_time")
+        worst = (f"{name} ≤ {np.max(np.asarray(getattr(self, name))):.4g}" for name in names)
+        return f"Truncation(times={describe_array(self.times)}, {', '.join(worst)})"
 
     def messages(self) -> list[str]:
         """Return a sentence for each kind of unresolved time. Values must be concrete."""

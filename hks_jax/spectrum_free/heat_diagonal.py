@@ -129,9 +129,8 @@ def _diagonal(
     # Scale before NaN is inserted, because NaN would enter the derivatives of the scales as 0·NaN.
     space = part.space
     if settings is None:
-        return space.extend(
-            scale[:, None] * selected_inversion(part.stiffness, part.mass, times, dissect(part.pattern))
-        )
+        diagonals = selected_inversion(part.stiffness, part.mass, times, dissect(part.pattern))
+        return space.extend(scale[:, None] * diagonals)
     values = scale.reshape(-1, *[1] * len(space.node_shape)) * _by_colours(settings, part, times)
     if checked:
         # Multiplication makes the derivatives NaN as well.

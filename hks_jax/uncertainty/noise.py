@@ -1,6 +1,7 @@
 """The noise of measured tensors: its covariance at every node, and its correlation between nodes."""
 
 import math
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -46,26 +47,15 @@ class TensorNoise(eqx.Module):
         [[1.0, 1.0], [1.0, 1.0]]
     """
 
-    covariance: Float[Array, "*shape m m"]
-    grid: Grid | None = eqx.field(static=True)
-    correlation: float = eqx.field(static=True)
-    modes: Float[Array, "*shape n m"] | None
-    freedom: float = eqx.field(static=True)
+    covariance: Float[Array | np.ndarray, "*shape m m"] = eqx.field(converter=partial(real_array, "covariance"))
+    grid: Grid | None = eqx.field(static=True, default=None)
+    correlation: float = eqx.field(static=True, default=0.0)
+    modes: Float[Array, "*shape n m"] | None = eqx.field(default=None, kw_only=True)
+    freedom: float = eqx.field(static=True, default=math.inf, kw_only=True)
 
-    def __init__(
-        self,
-        covariance: Any,
-        grid: Grid | None = None,
-        correlation: float = 0.0,
-        *,
-        modes: Any = None,
-        freedom: float = math.inf,
-    ) -> None:
-        self.covariance = real_array("covariance", covariance)
-        self.modes, self.freedom = modes, freedom
-        self.grid = grid
-        require_number("correlation", correlation, inclusive=True)
-        self.correlation = float(correlation)
+    def __check_init__(self) -> None:
+        grid = self.grid
+        require_number("correlation", self.correlation, inclusive=True)
         shape = self.covariance.shape
         if len(shape) < 3 or shape[-1] != shape[-2] or shape[-1] not in (3, 6):
             raise ValueError(
@@ -74,7 +64,7 @@ class TensorNoise(eqx.Module):
             )
         if grid is not None and shape[:-2] != grid.shape:
             raise ValueError(f"covariance: got shape {shape}; expected {(*grid.shape, *shape[-2:])}, as the grid")
-        if correlation and grid is None:
+        if self.correlation and grid is None:
             raise ValueError("correlation: got a length but no grid; expected both. Pass the grid of the tensors")
         if not is_traced(self.covariance):
             _check_semidefinite(np.asarray(self.covariance))
@@ -130,14 +120,12 @@ class TensorNoise(eqx.Module):
         from all nodes inside the mask. A median gives the size of the covariance; the correlation of neighbours along
         the axes gives the length. The scans must be aligned, and their noise must be independent and have the same
         covariance. The estimate of the noise includes the effect of motion between the scans.
+        The mean of both scans has half the covariance.
 
         Args:
             first: (*shape, d, d), the tensors of the first scan.
             second: (*shape, d, d), the tensors of the second scan.
             grid: the grid of both scans.
-
-        Returns:
-            The noise of one scan. The mean of both scans has half the covariance.
 
         Raises:
             ValueError: The tensors do not have the shape of the grid, or both scans are equal.
@@ -215,7 +203,7 @@ class TensorNoise(eqx.Module):
             kernels = [jnp.asarray(each, white.dtype) for each in gaussians(self.grid, self.correlation)]
             white = along_axes(kernels, white)
         if self.modes is None:
-            root = _root(self.covariance).astype(white.dtype)
+            root = _root(jnp.asarray(self.covariance)).astype(white.dtype)
             parts = jnp.einsum("...ab,...b->...a", root, white, precision="highest")
         else:
             parts = jnp.einsum("...na,n->...a", self.modes.astype(white.dtype), white, precision="highest")

@@ -17,15 +17,13 @@ def smooth_tensors(grid: Grid, tensors: Any, width: float) -> Float[Array, "*sha
     """Return the log-Euclidean mean of positive definite tensors with Gaussian weights around each node.
 
     The logarithms of the tensors are averaged, so the logarithm of the determinant is averaged with the same weights
-    (Arsigny, Fillard, Pennec and Ayache 2006). At the boundary, the mean includes only nodes inside the mask.
+    (Arsigny, Fillard, Pennec and Ayache 2006). At the boundary, the mean includes only nodes inside the mask. The
+    result is differentiable, and the identity outside the mask.
 
     Args:
         grid: the grid of the tensors; nodes outside its mask do not contribute.
         tensors: (*shape, d, d), positive definite inside the mask.
         width: the standard deviation of the Gaussian, in coordinate units; 0 for no smoothing.
-
-    Returns:
-        (*shape, d, d), the smoothed tensors; the identity outside the mask. They are differentiable.
 
     Raises:
         ValueError: The tensors do not have the shape of the grid, or the width is negative.

@@ -32,19 +32,11 @@ def write_page(path: Path) -> None:
     field = hj.TensorField.from_diffusion(grid, plane.tensors.astype(float), metric="inverse")
     diffusivity = np.median(np.trace(plane.tensors[grid.inside], axis1=-2, axis2=-1)) / 2
     times = LENGTHS**2 / diffusivity
-    hj.plot.explore(
-        hj.hks(hj.eigenpairs(field, PAIRS, boundary=BOUNDARY), times),
-        times,
-        grid,
-        path,
-        tensors=plane.tensors,
-        title="A brain slice",
-        facts={"grid": " × ".join(map(str, grid.shape)), "metric": "D⁻¹", "boundary": BOUNDARY, "eigenpairs": PAIRS},
-        unit="s",
-        lengths=LENGTHS,
-        length_unit="mm",
-        world=plane.volume_affine[:3, [0, 1, 3]],
-    )
+    pairs = hj.eigenpairs(field, PAIRS, boundary=BOUNDARY)
+    values, eigenvalues = (np.asarray(array) for array in (hj.hks(pairs, times), pairs.eigenvalues))
+    report = {"settings": {"metric": "inverse", "boundary": BOUNDARY}}
+    result = hj.io.Result(plane.with_mask(grid.mask), values, times, eigenvalues, report)
+    hj.plot.explore(result, path, title="A brain slice")
 
 
 def main() -> None:

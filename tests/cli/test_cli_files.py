@@ -143,7 +143,7 @@ def test_the_times_that_info_names_are_those_of_the_spectrum(tmp_path, capsys):
     eigenvalues = np.sort((np.pi**2 * ((i / a) ** 2 + (j / b) ** 2)).ravel())
     assert suits["k"] == 200
     assert suits["least_time_of_k"] == pytest.approx(4.6 / eigenvalues[200], rel=0.2)  # where the tail is 1 %
-    assert suits["largest_time"] == pytest.approx(2 * np.log(10) / eigenvalues[1], rel=0.1)
+    assert suits["largest_time"] == pytest.approx(max(a, b) ** 2 / 4, rel=0.1)  # √t is half the longer side
     assert suits["least_time"] == pytest.approx(6 * max(2 * 0.1**2, 0.5 * 0.2**2))
     needed = np.searchsorted(eigenvalues, 4.6 / suits["least_time"])
     assert suits["k_for_least_time"] == pytest.approx(needed, rel=0.2)
@@ -160,10 +160,10 @@ def test_what_info_names_of_a_masked_domain_is_of_its_pieces_and_of_the_mean(tmp
         return found["suits"]["tensor"]
 
     assert suits((90, 80), 3) == (small := suits((45, 40), 1))
-    assert small["largest_time"] == pytest.approx(2 * np.log(10) * (29 / np.pi) ** 2)
+    assert small["largest_time"] == pytest.approx((29 / 2) ** 2)
     grid = hj.Grid((30, 24))
     values = hj.eigenpairs(hj.TensorField(grid, np.broadcast_to(np.eye(2), (30, 24, 2, 2))), 200, "mean").eigenvalues
-    assert small["largest_time"] == pytest.approx(2 * np.log(10) / float(values[1]), rel=0.01)
+    assert small["largest_time"] == pytest.approx(np.pi**2 / 4 / float(values[1]), rel=0.01)
     assert small["least_time_of_k"] == pytest.approx(4.6 / float(values[-1]), rel=0.25)
 
 
@@ -182,17 +182,39 @@ def test_info_of_invalid_tensors_and_meshes(tmp_path, capsys):
     meshio.Mesh(square, [("triangle", np.array([[0, 1, 2], [0, 2, 3]]))]).write(tmp_path / "m.vtk")
     assert main(["info", str(tmp_path / "m.vtk")]) == 0
     text = capsys.readouterr().out
-    assert "mesh            4 vertices, 2 triangles" in text
-    assert "area            1" in text
-    assert "boundary        4 vertices" in text
+    for line in ("vertices          4", "triangles         2", "area              1", "boundary vertices 4"):
+        assert f"{line}\n" in text
     ball = hj.examples.ball_mesh(3)
     meshio.Mesh(np.asarray(ball.vertices), [("tetra", ball.cells)]).write(tmp_path / "b.vtu")
     assert main(["info", str(tmp_path / "b.vtu")]) == 0
     text = capsys.readouterr().out
-    assert "mesh            147 vertices, 540 tetrahedra" in text
-    assert "boundary        92 vertices" in text
-    assert f"volume          {float(hj.assemble(ball).volume):.5g}" in text
+    volume = f"volume            {float(hj.assemble(ball).volume):.5g}"
+    for line in ("vertices          147", "tetrahedra        540", "boundary vertices 92", volume):
+        assert f"{line}\n" in text
     assert "absent.nii: no such file" in error_of(capsys, ["info", str(tmp_path / "absent.nii")])
+
+
+def test_info_of_results_says_what_they_are_and_how_to_draw_them(tensors, tmp_path, capsys):
+    volume = read_tensors(tensors)
+    report = {"settings": {"metric": "inverse", "normalisation": "flat"}}
+    (tmp_path / "out").mkdir()
+    result = Result(volume, np.ones((8, *SHAPE)), np.arange(1.0, 9.0), report=report)
+    result.save(tmp_path / "out" / "hks", ".nii.gz")
+    replace(result, values=np.ones((1, *SHAPE)), times=np.zeros(0), name="curvature").save(tmp_path / "K", "")
+    for name in ("out", "out/hks.npz", "out/hks.nii.gz"):
+        assert main(["info", str(tmp_path / name)]) == 0
+        text = capsys.readouterr().out
+        assert "result          heat kernel signature\n" in text
+        assert "times           1, 2, 3, 4, 5, 6, 7, 8\n" in text
+        assert "normalisation   flat\n" in text
+        assert f"hks-jax plot {tmp_path / 'out' / 'hks.npz'} -o picture.png\n" in text
+    assert main(["info", str(tmp_path / "K.npz"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["result"], found["times"], found["to draw it"]) == (
+        "Gaussian curvature",
+        [],
+        f"hks-jax plot {tmp_path / 'K.npz'} -o picture.png",
+    )
 
 
 # ------------------------------------------------------------------------------------------------------ meshes

@@ -23,7 +23,7 @@ import hks_jax as hj
 from hks_jax.cli import build_parser, main
 from hks_jax.cli.job import Settings
 from hks_jax.cli.progress import StudyProgress
-from hks_jax.cli.study.batch import Range, common_times, suitable_range
+from hks_jax.cli.study.batch import common_times, suitable_range
 from hks_jax.cli.study.folder import Study
 from hks_jax.cli.study.subjects import read_subjects
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
@@ -416,12 +416,12 @@ def test_rows_join_the_options_of_the_command(tmp_path):
 
 
 def test_common_times_suit_all_subjects():
-    ranges = {"sub-01": Range(2.0, 50.0), "sub-02": Range(3.0, 80.0)}
+    ranges = {"sub-01": (2.0, 50.0), "sub-02": (3.0, 80.0)}
     assert common_times(ranges, 3, "scanner") == (3.0, 12.2, 50.0)
     scaled = common_times(ranges, 2, "lambda1")
-    np.testing.assert_allclose(scaled, 2 * np.log(10) * np.array([2 / 50, 1]), rtol=5e-3)
-    with pytest.raises(ValueError, match="sub-02 resolves only t ≥ 4, and sub-01 is nearly constant for t ≥ 3"):
-        common_times({"sub-01": Range(2.0, 3.0), "sub-02": Range(4.0, 9.0)}, 3, "scanner")
+    np.testing.assert_allclose(scaled, np.pi**2 / 4 * np.array([2 / 50, 1]), rtol=5e-3)
+    with pytest.raises(ValueError, match="sub-02 resolves only t ≥ 4, and the size of sub-01 allows only t ≤ 3"):
+        common_times({"sub-01": (2.0, 3.0), "sub-02": (4.0, 9.0)}, 3, "scanner")
 
 
 def test_automatic_times_follow_the_metric_and_remain_those_of_the_study(study, monkeypatch, capsys):
@@ -435,7 +435,7 @@ def test_automatic_times_follow_the_metric_and_remain_those_of_the_study(study, 
     np.testing.assert_allclose(suitable(2.0, 8, "neumann"), suitable(1.0, 8, "neumann") / 2, rtol=1e-12)
     np.testing.assert_allclose(suitable(1.0, 8, "mean"), suitable(1.0, 4, "neumann"), rtol=1e-12)
     side = 54.0  # mm, of the largest axis, along which D is about 1.5e-3 mm²/s
-    assert abs(suitable(1.0, 8, "neumann")[1] / (2 * np.log(10) * (side / np.pi) ** 2 / 1.5e-3) - 1) < 0.3
+    assert abs(suitable(1.0, 8, "neumann")[1] / ((side / 2) ** 2 / 1.5e-3) - 1) < 0.3
     assert suitable(1.0, 1, "neumann")[0] > suitable(1.0, 8, "neumann")[0]
 
     def times(*more):
@@ -444,14 +444,15 @@ def test_automatic_times_follow_the_metric_and_remain_those_of_the_study(study, 
 
     monkeypatch.setattr("hks_jax.cli.study.tasks.run_all", lambda *_: {})
     monkeypatch.setattr(Study, "write_group", lambda *_: [])
+    save_tensors(study / "t3.nii.gz", volume(0.9))
     first = times()
     with open(study / "subjects.tsv", "a") as stream:
         stream.write("04\tt1.nii.gz\tcontrol\n05\tt4.nii.gz\tcontrol\n")
-    save_tensors(study / "t4.nii.gz", volume(0.9 * 0.7))
+    save_tensors(study / "t4.nii.gz", volume(0.8))
     assert times() == first
     other = ("--interpolation", "log-euclidean")
     assert main(command(study, "out", "--times", "auto:2", *other)) == 2
-    assert 'differs in --interpolation: "linear", now "log-euclidean". Choose' in capsys.readouterr().err
+    assert "has --interpolation linear, not log-euclidean. Leave" in capsys.readouterr().err
     assert times("--replace", *other)[0] > first[0]  # chosen anew, of all subjects
 
 
@@ -604,12 +605,35 @@ def test_a_study_keeps_the_boundary_that_it_began_with(study, monkeypatch, capsy
     monkeypatch.setattr("hks_jax.cli.study.tasks.run_all", lambda *_: {})
     monkeypatch.setattr(Study, "write_group", lambda *_: [])
     assert boundary("new") == "mean"
-    assert "boundary mean for all subjects" in capsys.readouterr().err
+    assert "options for all subjects: --boundary mean\n" in capsys.readouterr().err
     assert boundary("old", "--boundary", "neumann:dirichlet,neumann") == [["neumann", "dirichlet"], "neumann"]
     assert boundary("old") == [["neumann", "dirichlet"], "neumann"]
     assert main(command(study, "old", "--times", "3e3", "--boundary", "mean")) == 2
-    assert "differs in --boundary" in capsys.readouterr().err
+    assert "has --boundary neumann:dirichlet,neumann, not mean. Leave" in capsys.readouterr().err
     assert boundary("old", "--replace") == "mean"
+
+
+def test_omitted_options_are_those_of_the_study(study, monkeypatch, capsys):
+    monkeypatch.setattr("hks_jax.cli.study.tasks.run_all", lambda *_: {})
+    monkeypatch.setattr(Study, "write_group", lambda *_: [])
+    kept = ["--normalisation", "flat", "--repair", "clip:1e-4", "--times", "3e3", "6e3", "--time-unit", "lambda1"]
+    assert main(command(study, "out", "--erode", "0", *kept)) == 0
+    record = (study / "out" / "study.json").read_text()
+    capsys.readouterr()
+    short = ["batch", str(study / "subjects.tsv"), "-o", str(study / "out")]
+    assert main(short) == 0
+    assert (study / "out" / "study.json").read_text() == record
+    printed = capsys.readouterr().err
+    for option in ("-k 8", "--slice z=1", "--repair clip:0.0001", "--times 3000.0,6000.0", "--normalisation flat"):
+        assert option in printed
+    assert main([*short, "-k", "9", "--normalisation", "raw", "--times", "auto:4", "--noise", "0.1"]) == 2
+    printed = capsys.readouterr().err
+    for text in ("-k 8, not 9;", "--normalisation flat, not raw;", "--times 3000.0,6000.0, not auto:4;"):
+        assert text in printed
+    assert "--noise unset, not 0.1" in printed
+    assert "Leave these options out to continue the study" in printed
+    assert main([*short, "-k", "9", "--metric", "inverse", "--slice", "z=1", "--times", "9", "--replace"]) == 0
+    assert json.loads((study / "out" / "study.json").read_text())["settings"]["normalisation"] == "raw"
 
 
 @pytest.mark.slow
@@ -657,7 +681,7 @@ def test_a_study_has_errors_of_regions_and_computes_again_what_had_other_noise(s
     assert [noise["source"] for noise in noises] == ["second.nii.gz", "0.01"]
     before = contents(study / "out")
     assert main([*words, "--draws", "12"]) == 2
-    assert "differs in --draws: 8, now 12" in capsys.readouterr().err
+    assert "has --draws 8, not 12. Leave" in capsys.readouterr().err
     scan_again()  # nothing is solved again but the noisy maps, of the one subject
     monkeypatch.setattr("hks_jax.cli.study.tasks.compute_pairs", None)
     assert main(words) == 0

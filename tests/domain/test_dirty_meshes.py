@@ -63,7 +63,11 @@ def test_what_other_programs_write(tmp_path, name, text):
         ("m.obj", V, "has no triangles"),
         ("m.off", f"OFF\n4 4 6\n{POINTS}{FACES[:-8]}", "declares 4 vertices and 4 faces, but has 7 lines"),
         ("m.off", f"OFF\n4 4 6\n{POINTS}{FACES}".replace("3 0 3 2", "3 0 3"), "got the face 3 0 3"),
-        ("m.off", f"OFF\n4 4 6\n{POINTS}{FACES}".replace("0 0 1\n", "0 0\n"), "differ in the number of columns"),
+        (
+            "m.off",
+            f"OFF\n4 4 6\n{POINTS}{FACES}".replace("0 0 1\n", "0 0\n"),
+            r"\[2, 3\] columns; expected 3",
+        ),
         ("m.off", f"4OFF\n4 4 6\n{POINTS}{FACES}", "does not begin with OFF"),
         ("m.off", "", "does not begin with OFF"),
     ],

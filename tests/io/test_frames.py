@@ -232,6 +232,7 @@ def test_own_files_say_along_which_axes_they_are(scan, capsys):
     assert main(["info", str(out)]) == 0
     printed = capsys.readouterr().out
     angle = coherence(own).angle
+    assert "The axes of the tensors seem right. Principal directions differ" in printed
     assert f"by {angle:.1f}° on average, and clearly more along the fsl axes, or with y, z reversed\n" in printed
     assert "--frame" not in printed
     # Whoever mirrors it nevertheless is told.

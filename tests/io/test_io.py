@@ -294,7 +294,7 @@ def test_masks_of_every_kind_of_file(tmp_path, volume):
 def test_bad_masks(tmp_path, volume):
     hj.io.save_tensors(tmp_path / "t.nii", volume)
     np.save(tmp_path / "m.npy", np.ones((4, 5)))
-    with pytest.raises(ValueError, match=r"mask: got shape \(4, 5\); expected the tensors' shape \(4, 5, 6\)"):
+    with pytest.raises(ValueError, match=r"mask: got shape \(4, 5\); expected the shape of the image, \(4, 5, 6\)"):
         hj.io.read_tensors(tmp_path / "t.nii", mask=tmp_path / "m.npy")
     elsewhere = volume.affine.copy()
     elsewhere[0, 3] += 2.0
@@ -531,7 +531,7 @@ def test_bad_scans(scan, volume):
     np.savetxt(scan / "short", np.zeros((1, 7)))
     with pytest.raises(ValueError, match="7 b-values"):
         hj.io.fit_dwi(names[0], scan / "short", names[2], volume.mask)
-    with pytest.raises(ValueError, match="expected the images' shape"):
+    with pytest.raises(ValueError, match="expected the shape of the image"):
         hj.io.fit_dwi(*names, np.ones((2, 2, 2), bool))
 
 
@@ -584,6 +584,7 @@ def test_results_come_back_as_they_were_saved(tmp_path, rng, times):
     assert recorded_boundary(read.settings) == settings["boundary"]
     assert read.unit == "s"
     if times.size:
+        assert repr(read) == f"Result(hks: float64 (2, 6, 5), 2 times 1 … 2.5 s, source='{tmp_path / 'hks.npz'}')"
         np.testing.assert_allclose(read.z, (values - 1) / (0.1 + values))
     else:
         assert read.z is None

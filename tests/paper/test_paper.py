@@ -10,7 +10,7 @@ from matplotlib.image import imread
 
 from hks_jax import Grid, SurfaceMesh, TensorField, plot
 from hks_jax.domain.examples import bumpy_torus_field, bumpy_torus_mesh, figure3_fields, figure4_fields
-from hks_jax.paper import figure6, figures, run, table1, triangles
+from hks_jax.paper import figures, run, table1, triangles
 from hks_jax.paper.signature import continued_signature, enough_pairs, flat_signature, signature
 
 # What an independent implementation of the same method gives.
@@ -157,8 +157,7 @@ def cheap(monkeypatch):
             values = np.where(domain.grid.inside, 2 + np.sin(domain.grid.nodes).sum(axis=-1), np.nan)
         return np.stack([values / t for t in times])
 
-    for module in (figures, figure6):
-        monkeypatch.setattr(module, "signature", cheap_signature)
+    monkeypatch.setattr(figures, "signature", cheap_signature)
     monkeypatch.setattr(figures, "flat_signature", lambda f, t, b="neumann": cheap_signature(f, [t], 1)[0])
     monkeypatch.setattr(figures, "continued_signature", lambda f, t, d: cheap_signature(f, [t], 1)[0])
     monkeypatch.setattr(figures, "hks_expansion", lambda f, t: cheap_signature(f, t, 1))
@@ -257,7 +256,7 @@ def test_figure_5_has_all_indices(tmp_path, drawn, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.usefixtures("cheap")
 def test_figure_6_draws_a_phantom_where_there_is_no_brain(tmp_path, drawn, monkeypatch):
-    monkeypatch.setattr(figure6, "find_example_brain", lambda: None)
+    monkeypatch.setattr(figures, "find_example_brain", lambda: None)
     fig = draw("figure6", tmp_path, drawn, monkeypatch)
     assert len(fig.axes) == 10
     assert "phantom" in fig.get_suptitle()

@@ -6,6 +6,7 @@ import json
 import re
 import time
 import tomllib
+from dataclasses import replace
 from fnmatch import fnmatch
 from importlib.resources import files
 from pathlib import Path
@@ -19,7 +20,7 @@ from browser import Browser, find_browser
 
 import hks_jax as hj
 from hks_jax.cli import main
-from hks_jax.io import TensorVolume, save
+from hks_jax.io import Result, TensorVolume, save
 from hks_jax.plot import explore
 from hks_jax.plot.explore import page as page_module
 
@@ -47,6 +48,16 @@ def tensors(shape=SHAPE):
     return a @ a.swapaxes(-1, -2) + 0.1 * np.eye(len(shape))
 
 
+def of(values, grid=None, tensors=None, **arrays):
+    """Return a result on a grid, from a file without tensors unless they are given."""
+    grid = hj.Grid(values.shape[1:]) if grid is None else grid
+    known = (
+        np.broadcast_to(np.eye(grid.dimension), (*grid.shape, *[grid.dimension] * 2)) if tensors is None else tensors
+    )
+    place = TensorVolume(known, grid.spacing, grid.origin, grid.mask)
+    return Result(place, values, TIMES, arrays=arrays, source="a file" if tensors is None else "")
+
+
 def block(text, name, dtype):
     (found,) = re.findall(rf'id="{name}">([^<]*)<', text)
     return np.frombuffer(base64.b64decode(found), dtype)
@@ -57,7 +68,7 @@ def block(text, name, dtype):
 
 def test_the_page_holds_the_numbers_and_asks_for_nothing(tmp_path):
     grid, values = hj.Grid(SHAPE, (0.5, 0.25), (1.0, 2.0)), signature()
-    path = explore(values, TIMES, grid, tmp_path / "deep" / "page.html", tensors=tensors(), title=EVIL)
+    path = explore(of(values, grid, tensors()), tmp_path / "deep" / "page.html", title=EVIL)
     text = path.read_text(encoding="utf-8")
     inside = np.isfinite(values[0])
     low, high = [a.min() for a in np.nonzero(inside)], [a.max() + 1 for a in np.nonzero(inside)]
@@ -83,7 +94,7 @@ def test_the_page_holds_the_numbers_and_asks_for_nothing(tmp_path):
 def test_three_dimensions_have_fractional_anisotropy_and_powers_of_three_halves(tmp_path):
     shape = (6, 5, 4)
     values = signature(shape)
-    text = explore(values, TIMES, hj.Grid(shape), tmp_path / "page.html", tensors=tensors(shape)).read_text()
+    text = explore(of(values, tensors=tensors(shape)), tmp_path / "page.html").read_text()
     inside = np.isfinite(values[0])
     shown = block(text, "values", "<f4").reshape(TIMES.size, -1)
     np.testing.assert_allclose(shown, (4 * np.pi * TIMES[:, None]) ** 1.5 * values[:, inside], rtol=1e-6)
@@ -92,33 +103,33 @@ def test_three_dimensions_have_fractional_anisotropy_and_powers_of_three_halves(
 
 
 @pytest.mark.parametrize(
-    ("changed", "words"),
+    ("changed", "more", "words"),
     [
-        ({"times": TIMES[::-1]}, "times: got"),
-        ({"values": signature()[1:]}, r"values: got shape \(6, 24, 18\)"),
-        ({"values": np.full((7, *SHAPE), np.nan)}, "finite values at all times"),
-        ({"tensors": tensors()[1:]}, r"tensors: got shape"),
-        ({"tensors": np.full((*SHAPE, 2, 2), np.nan)}, "tensors: got NaN or infinite"),
-        ({"maps": {"age": np.ones(3)}}, r"maps\['age'\]: got shape \(3,\)"),
-        ({"labels": np.ones(SHAPE) / 2}, "labels: got fractional numbers"),
-        ({"labels": np.zeros(SHAPE)}, "labels: got 0 at all nodes"),
-        ({"labels": np.zeros((3, 3))}, "labels: got shape"),
-        ({"normalisation": "flatt"}, "normalisation: got 'flatt'"),
-        ({"lengths": TIMES[1:]}, r"lengths: got shape \(6,\)"),
-        ({"world": np.eye(4)}, "world: got shape"),
+        ({"times": TIMES[::-1]}, {}, "times: got"),
+        ({"values": signature()[1:]}, {}, r"values: got shape \(6, 24, 18\)"),
+        ({"values": np.full((7, *SHAPE), np.nan)}, {}, "finite values at all times"),
+        ({"arrays": {"deviation": np.ones(2)}}, {}, r"deviation: got shape \(2,\)"),
+        (
+            {"place": of(signature(), tensors=np.full((*SHAPE, 2, 2), np.nan)).place, "source": ""},
+            {},
+            "tensors: got NaN",
+        ),
+        ({}, {"maps": {"age": np.ones(3)}}, r"maps\['age'\]: got shape \(3,\)"),
+        ({}, {"labels": np.ones(SHAPE) / 2}, "labels: got fractional numbers"),
+        ({}, {"labels": np.zeros(SHAPE)}, "labels: got 0 at all nodes"),
+        ({}, {"labels": np.zeros((3, 3))}, "labels: got shape"),
     ],
 )
-def test_what_cannot_be_shown_is_refused(changed, words, tmp_path):
-    given = {"values": signature(), "times": TIMES, "grid": hj.Grid(SHAPE), "path": tmp_path / "page.html", **changed}
+def test_what_cannot_be_shown_is_refused(changed, more, words, tmp_path):
     with unchecked(), pytest.raises(ValueError, match=words):
-        explore(**given)
+        explore(replace(of(signature()), **changed), tmp_path / "page.html", **more)
     assert not list(tmp_path.iterdir())
 
 
 def test_too_many_numbers_are_refused_before_they_are_written(tmp_path, monkeypatch):
     monkeypatch.setattr(page_module, "LIMIT", 1000)
     with pytest.raises(ValueError, match=r"7 times at \d+ nodes take .* MiB; expected at most"):
-        explore(signature(), TIMES, hj.Grid(SHAPE), tmp_path / "page.html")
+        explore(of(signature()), tmp_path / "page.html")
 
 
 def test_every_file_beside_the_code_is_packaged():
@@ -211,9 +222,7 @@ def plane(browser, tmp_path):
     browser.requests.clear()
     browser.resize(1200, 900)
     labels = np.where(np.arange(SHAPE[0])[:, None] < 8, 3, 0) + np.zeros(SHAPE)
-    path = explore(
-        signature(), TIMES, hj.Grid(SHAPE), tmp_path / "page.html", tensors=tensors(), labels=labels, title=EVIL
-    )
+    path = explore(of(signature(), tensors=tensors()), tmp_path / "page.html", labels=labels, title=EVIL)
     browser.open(path)
     yield browser
     assert browser.problems == []
@@ -295,7 +304,7 @@ def test_what_noise_could_make_fades_and_points_have_bands(browser, tmp_path):
     noise = np.full_like(flat, 1e-9)
     noise[:, *node] = np.abs(flat[:, *node] - 1)  # one standard deviation from flat space
     scale = 4 * np.pi * TIMES[:, None, None]
-    path = explore(signature(), TIMES, hj.Grid(SHAPE), tmp_path / "noise.html", deviation=noise / scale)
+    path = explore(of(signature(), deviation=noise / scale), tmp_path / "noise.html")
     browser.open(path)
     browser.choose("#time", "4")
 
@@ -311,8 +320,6 @@ def test_what_noise_could_make_fades_and_points_have_bands(browser, tmp_path):
     np.testing.assert_allclose(columns["4πt·HKS A standard deviation by noise"], noise[:, *node], rtol=1e-6)
     assert browser.run("document.querySelectorAll('#chart polygon').length") == 1
     assert all("willReadFrequently" in problem for problem in browser.problems)
-    with unchecked(), pytest.raises(ValueError, match=r"deviation: got shape \(2,\)"):
-        explore(signature(), TIMES, hj.Grid(SHAPE), path, deviation=np.ones(2))
 
 
 @needs_browser
@@ -389,7 +396,7 @@ def test_nothing_leaves_the_window(plane, width):
 def test_slices_of_a_volume(browser, tmp_path):
     browser.problems.clear()
     shape = (10, 9, 8)
-    path = explore(signature(shape), TIMES, hj.Grid(shape, (1, 1, 2)), tmp_path / "page.html", tensors=tensors(shape))
+    path = explore(of(signature(shape), hj.Grid(shape, (1, 1, 2)), tensors(shape)), tmp_path / "page.html")
     browser.open(path)
     z = int(browser.text("#points").split("node")[1].split(",")[2].split("position")[0])
     assert browser.text("#slice-text") == f"z = {z}"

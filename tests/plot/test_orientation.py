@@ -304,18 +304,25 @@ def test_what_is_no_background():
     ],
 )
 def test_colours_of_what_is_positive_are_not_negative(values, expected):
-    assert colours_of(np.array(values), (0, 1), centre=1.0) == pytest.approx(expected)
+    assert colours_of([np.array(values)], (0, 1), centre=1.0) == [pytest.approx(expected)]
 
 
 def test_a_centre_of_zero_is_one_of_either_sign():
-    assert colours_of(np.array([0.0, 2.0]), (0, 1), centre=0.0) == (-2.0, 2.0, "RdBu_r")
+    assert colours_of([np.array([0.0, 2.0])], (0, 1), centre=0.0) == [(-2.0, 2.0, "RdBu_r")]
+
+
+@pytest.mark.parametrize("rounding", [-1e-12, 0.0, 1e-12])
+def test_all_panels_of_a_figure_have_one_colour_map(rounding):
+    near, flat, late = np.linspace(0.8, 1.3, 9), np.full(9, 2.0) + rounding, np.linspace(1.9, 2.4, 9)
+    assert [each.cmap for each in colours_of([near, near, flat], (0, 1), centre=1.0)] == ["RdBu_r"] * 3
+    assert [each.cmap for each in colours_of([near, late, late], (0, 1), centre=1.0)] == ["viridis"] * 3
 
 
 @pytest.mark.slow
 def test_automatic_times_end_where_something_is_left_to_see(tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(
-        "hks_jax.plot.signature.scalar_image", lambda ax, values, grid, **more: drawn.append((values, more))
+        "hks_jax.plot.panels.scalar_image", lambda ax, values, grid, **more: drawn.append((values, more))
     )
     field = hj.examples.torus_field((16, 16))
     np.savez(tmp_path / "t.npz", tensors=field.tensors, spacing=field.grid.spacing)
@@ -323,12 +330,12 @@ def test_automatic_times_end_where_something_is_left_to_see(tmp_path, monkeypatc
     assert main(["hks", str(tmp_path / "t.npz"), "-o", str(tmp_path / "out"), *options, "--times", "auto:5"]) == 0
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     last = report["times"][-1]["t"]
-    assert last * report["eigenpairs"]["first_positive"] == pytest.approx(2 * np.log(10))
+    assert last * report["eigenpairs"]["first_positive"] == pytest.approx(np.pi**2 / 4)
     values, more = drawn[-1]
     assert np.ptp(values) > 0.01 * values.max()
     assert more["vmin"] > 0  # far from 1, and positive
     # Where nothing is left, nothing is shown.
-    assert main(["hks", str(tmp_path / "t.npz"), "-o", str(tmp_path / "out"), *options, "--times", str(3 * last)]) == 0
+    assert main(["hks", str(tmp_path / "t.npz"), "-o", str(tmp_path / "out"), *options, "--times", str(6 * last)]) == 0
     values, more = drawn[-1]
     assert np.ptp(values) < 1e-3 * values.max()
     assert more["vmax"] - more["vmin"] == pytest.approx(0.01 * values.max(), rel=1e-2)

@@ -173,7 +173,9 @@ def test_rows_over_time():
     grid = hj.Grid((6, 4), mask=np.indices((6, 4))[0] < 5)
     rng = np.random.default_rng(0)
     rows = {"HKS": rng.random((3, 6, 4)), "trace": 5 + rng.random((3, 6, 4))}
-    fig = plot.time_rows(rows, [0.1, 1, 10], grid, unit="s", shared="row", cmap={"HKS": "viridis", "trace": "cividis"})
+    fig = plot.time_rows(
+        rows, [0.1, 1, 10], grid, unit="s", shared_range=True, cmap={"HKS": "viridis", "trace": "cividis"}
+    )
     assert len(fig.axes) == 6
     assert [ax.get_title() for ax in fig.axes[:3]] == ["$t$ = 0.1 s", "$t$ = 1 s", "$t$ = 10 s"]
     assert [fig.axes[i].get_ylabel() for i in (0, 3)] == list(rows)
@@ -185,8 +187,6 @@ def test_rows_over_time():
     assert own.axes[1].images[0].get_clim() == (rows["HKS"][1, :5].min(), rows["HKS"][1, :5].max())
     with pytest.raises(ValueError, match=r"rows: HKS: got shape \(3, 6, 4\).*; expected .* \(2, 6, 4\)"):
         plot.time_rows(rows, [0.1, 1], grid)
-    with pytest.raises(ValueError, match="shared: got 'all'"):
-        plot.time_rows(rows, [0.1, 1, 10], grid, shared="all")
     with pytest.raises(ValueError, match="rows: got no scalars"):
         plot.time_rows({}, [0.1], grid)
 

@@ -1,5 +1,7 @@
 """The pictures: what is drawn is where, as large and as coloured as the mathematics says."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from annotations import unchecked
@@ -7,6 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from hks_jax import Grid, SurfaceMesh, TensorField
 from hks_jax.domain.examples import ball_mesh
+from hks_jax.io import Result, TensorVolume
 from hks_jax.plot import (
     ellipses,
     evenly_spaced_lines,
@@ -17,9 +20,11 @@ from hks_jax.plot import (
     save_figure,
     scalar_image,
     sensitivity,
+    signature_panels,
     surface,
     trace,
 )
+from hks_jax.plot.glyphs import FILL
 from hks_jax.plot.signature import away_from_rim, bounding_box
 
 
@@ -221,8 +226,6 @@ def test_ellipse_errors():
         ellipses(ax, field, kind="glyph")
     with unchecked(), pytest.raises(ValueError, match="sizes: got 'big'"):
         ellipses(ax, field, sizes="big")
-    with pytest.raises(ValueError, match=r"fill: got 1.5"):
-        ellipses(ax, field, fill=1.5)
     with pytest.raises(ValueError, match=r"every: got 0; expected one positive integer"):
         ellipses(ax, field, every=0)
 
@@ -334,7 +337,7 @@ def test_hks_curves_are_the_values_at_the_nodes():
     np.testing.assert_allclose(lines[0].get_ydata(), values[:, 1, 1])
     np.testing.assert_allclose(lines[1].get_ydata(), values[:, 4, 3])
     assert len(ax.lines) == 4
-    np.testing.assert_allclose(ax.lines[1].get_ydata(), 2 * values[:, 1, 1])
+    np.testing.assert_allclose(ax.lines[2].get_ydata(), 2 * values[:, 1, 1])
     assert [t.get_text() for t in ax.get_legend().get_texts()] == ["(0.5, 0.5)", "(2, 1.5)", "expansion"]
     assert ax.get_xscale() == ax.get_yscale() == "log"
     scaled = hks_curves(new_figure(3, 3).subplots(), values, times, grid, [[0, 0]], scaled=True, labels=["a"])
@@ -394,17 +397,18 @@ def test_sensitivity_draws_the_eigenvectors_of_either_sign():
     gradient[2, 3] = [[4.0, 0.0], [0.0, -1.0]]
     gradient[4, 4] = [[0.0, 1.0], [1.0, 0.0]]  # ±1 along the diagonals
     ax = new_figure(3, 3).subplots()
-    bars = sensitivity(ax, grid, gradient, every=1, fill=1.0)
+    bars = sensitivity(ax, grid, gradient, every=1)
     segments, colours = np.array(bars.get_segments()), bars.get_colors()
     lengths = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
     longest = np.argmax(lengths)
-    assert lengths[longest] == pytest.approx(0.5)  # one cell
-    np.testing.assert_allclose(np.sort(segments[longest], axis=0), [[0.75, 1.5], [1.25, 1.5]])
-    crossing = np.flatnonzero(np.isclose(lengths, 0.25) & np.isclose(segments.mean(axis=1), [1.0, 1.5]).all(axis=1))
+    half = 0.25 * FILL  # of a cell
+    assert lengths[longest] == pytest.approx(2 * half)
+    np.testing.assert_allclose(np.sort(segments[longest], axis=0), [[1 - half, 1.5], [1 + half, 1.5]])
+    crossing = np.flatnonzero(np.isclose(lengths, half) & np.isclose(segments.mean(axis=1), [1.0, 1.5]).all(axis=1))
     assert len(crossing) == 1
     assert not np.allclose(colours[longest], colours[crossing[0]])
     diagonal = np.flatnonzero(np.isclose(segments.mean(axis=1), [2.0, 2.0]).all(axis=1))
-    np.testing.assert_allclose(lengths[diagonal], 0.25)
+    np.testing.assert_allclose(lengths[diagonal], half)
     rising = np.prod(segments[diagonal, 1] - segments[diagonal, 0], axis=1) > 0
     np.testing.assert_array_equal(colours[diagonal][rising][0], colours[longest])  # both positive
     np.testing.assert_array_equal(colours[diagonal][~rising][0], colours[crossing[0]])  # both negative
@@ -414,7 +418,7 @@ def test_sensitivity_refuses_what_it_cannot_draw():
     ax = new_figure(3, 3).subplots()
     with pytest.raises(ValueError, match=r"gradient: got shape \(6, 6\); expected \(6, 6, 2, 2\)"):
         sensitivity(ax, Grid((6, 6)), np.zeros((6, 6)))
-    with pytest.raises(ValueError, match="gradient: got 36 NaN or infinite tensors of 36"):
+    with pytest.raises(ValueError, match="gradient: got NaN or infinite tensors"):
         sensitivity(ax, Grid((6, 6)), np.full((6, 6, 2, 2), np.nan), every=1)
 
 
@@ -457,3 +461,18 @@ def test_pictures_are_cropped_and_coloured_away_from_the_rim():
     deep = away_from_rim(solid)
     assert deep.sum() > solid.sum() / 3
     assert not deep[..., 1].any()
+
+
+@pytest.mark.parametrize(
+    ("normalisation", "title"),
+    [("raw", "HKS in units of $t^{-1}$"), ("flat", r"$4\pi t$·HKS, which is 1 for flat space")],
+)
+def test_pictures_of_a_signature_name_it_and_the_distance_of_diffusion(normalisation, title):
+    place = TensorVolume(np.broadcast_to(2 * np.eye(2), (6, 5, 2, 2)), (1.0, 1.0), (0.0, 0.0))
+    place = replace(place, length_unit="mm", unit="mm²/s")
+    report = {"settings": {"metric": "inverse", "normalisation": normalisation}}
+    values = np.stack([np.linspace(0.9, 1.1, 30).reshape(6, 5)] * 2)
+    figure = signature_panels(Result(place, values, np.array([2.0, 8.0]), report=report))
+    assert figure.get_suptitle() == f"{title}, metric D⁻¹"
+    titles = [ax.get_title() for ax in figure.axes]
+    assert titles == ["$t$ = 2 s\n$\\sqrt{Dt}$ = 2 mm", "$t$ = 8 s\n$\\sqrt{Dt}$ = 4 mm"]

@@ -86,6 +86,14 @@ def test_noise_fades_in_the_slices_that_have_it():
         assert (opacity[j, i], opacity.sum()) == (0.5, 0.5)
 
 
+def test_slices_run_through_the_nearest_node_with_a_value():
+    holed = ramp().astype(float)
+    holed[:, :, 3:] = np.nan
+    axes = new_figure(3, 6).subplots(3)
+    orthogonal_slices(axes, holed, GRID, node=(1, 2, 9))
+    assert axes[1].lines[1].get_ydata()[0] == 31  # k = 2
+
+
 def test_errors():
     with unchecked(), pytest.raises(ValueError, match=r"grid: got shape .* three dimensions"):
         volume_panels(np.zeros((1, 3, 3)), [1.0], Grid((3, 3)))
@@ -93,12 +101,6 @@ def test_errors():
         volume_panels(ramp(), [1.0], GRID)
     with pytest.raises(ValueError, match="limits: got 2; expected 1"):
         volume_panels(ramp()[None], [1.0], GRID, limits=[(0, 1)] * 2)
-    with pytest.raises(ValueError, match=r"node: got .* within the grid's shape"):
-        volume_panels(ramp()[None], [1.0], GRID, node=(1, 2, 9))
-    holed = ramp().astype(float)
-    holed[1, 2, 3] = np.nan
-    with pytest.raises(ValueError, match=r"node: got \(1, 2, 3\), which has no value; .* such as \(2, "):
-        volume_panels(holed[None], [1.0], GRID, node=(1, 2, 3))
     with pytest.raises(ValueError, match="axes: got 1; expected 3"):
         orthogonal_slices(new_figure(3, 3).subplots(1, 1, squeeze=False)[0], ramp(), GRID)
     with pytest.raises(ValueError, match="inside: got no node"):

@@ -141,6 +141,7 @@ def test_tail_estimate_is_of_the_right_size():
     true_tail = 1 - np.exp(-few.eigenvalues).sum() / np.exp(-many.eigenvalues).sum()
     assert 0.3 < hj.truncation(few, [1.0]).tail[0] / true_tail < 3
     alone = hj.truncation(hj.eigenpairs(flat((9, 10), (1.0, 1.0)), 1), [1.0])
+    assert repr(alone).startswith("Truncation(times=float64 (1,), tail ≤ ")
     assert not alone.messages()
 
 

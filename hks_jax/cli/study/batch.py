@@ -22,28 +22,27 @@ If the mean diffusivity of a subject, in mm2/s, is outside the range of living t
 a column named unit gives the unit, because subjects with different units cannot be compared.
 
 If a subject fails, the others are still computed. If the command is repeated, it computes only the signatures and
-tables that are missing, or whose input files have changed.
+tables that are missing, or whose input files have changed. Omitted options are then those of the study in DIR.
 
 examples:
   hks-jax batch subjects.tsv -o study --metric inverse --normalisation flat --atlas atlas.nii.gz
-  hks-jax batch subjects.tsv -o study --metric inverse --times 20 40 80 160 --only sub-07 sub-08
+  hks-jax batch subjects.tsv -o study --metric inverse --times 8e5 1.6e6 3.2e6 --only sub-07 sub-08
 """
 
 import argparse
 import io
-import json
 import math
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from hks_jax.cli.info import describe
 from hks_jax.cli.job import ComputationError, Settings
 from hks_jax.cli.noise import require_spectral, second_scan
-from hks_jax.cli.options import READING, SOLVING, refuse
+from hks_jax.cli.options import FILES, READING, SOLVING, defaults, flag, options_in, refuse
 from hks_jax.cli.outputs import Done, show
 from hks_jax.cli.progress import Progress, StudyProgress
 from hks_jax.cli.reading import read_volume, require_metric
@@ -51,20 +50,25 @@ from hks_jax.cli.study.folder import MAP, Study, reading_options
 from hks_jax.cli.study.subjects import Subject, read_subjects
 from hks_jax.cli.values import Times
 from hks_jax.io import TensorVolume
-from hks_jax.io.result import recorded_boundary
+from hks_jax.io.result import tuples
 from hks_jax.io.tables import read_json
 from hks_jax.io.units import LIVING_TISSUE
 from hks_jax.signatures.times import LAST
 
-OPTIONS = f"""
-subjects SUBJECTS  the table of subjects
--o,--output DIR!  the study's folder
-@metric {READING} {SOLVING} @signature @noise @view
+KEPT = f"""
+@metric {READING} {SOLVING} @signature @noise
 --time-unit scanner|lambda1 = scanner
     unit of --times: scanner, for the same t for all subjects, in seconds for D⁻¹ with D in mm²/s (default); or lambda1,
     for the same product λ₁t, so that the given numbers are divided by each subject's first positive eigenvalue λ₁.
     Automatic times are log-spaced over the range that suits all subjects, and the study keeps them
-@atlas @names
+"""
+DEFAULTS = {option.name: None for option in options_in(KEPT) if option.name not in FILES}
+"""The options that a study keeps, without a default, so that omitted options are known."""
+OPTIONS = f"""
+subjects SUBJECTS  the table of subjects
+-o,--output DIR!  the study's folder
+{KEPT}
+@atlas @names @view
 --save-pairs
     save the eigenpairs of each subject, which other --times, --normalisation or --method then reuse
 --replace  replace a study in DIR that has other settings or times
@@ -72,7 +76,7 @@ subjects SUBJECTS  the table of subjects
 """
 
 
-def run(args: argparse.Namespace, _: Progress) -> None:
+def run(args: argparse.Namespace, begun: Progress) -> None:
     """Run the command; if some subjects fail, raise ComputationError after computing the others."""
     from hks_jax.cli.study.tasks import run_all
 
@@ -80,9 +84,7 @@ def run(args: argparse.Namespace, _: Progress) -> None:
         why = "for all subjects; expected a number, residuals or roughness"
         raise ValueError(f"--noise: got {args.noise} {why}. Put second scans into a column named noise of the table")
     args.strict_unit = True
-    if settle := args.boundary is None:  # comparable subjects need the same condition, with or without a mask
-        before = {} if args.replace else read_json(args.output / "study.json")
-        args.boundary = recorded_boundary(before.get("settings", {})) or "mean"
+    note = _complete(args)
     subjects = read_subjects(args.subjects, args)
     chosen = _only(subjects, args.only)
     for subject in chosen:
@@ -93,8 +95,8 @@ def run(args: argparse.Namespace, _: Progress) -> None:
     if not with_regions:
         refuse(args, ("names",), "this option names labels, which are missing; pass --atlas, or a column named atlas")
     progress = StudyProgress(len(chosen), args.quiet)
-    if settle:
-        progress.end(f"boundary {args.boundary} for all subjects, because --boundary is not given")
+    progress.start = begun.start
+    progress.end(note)
     with progress.catching_warnings():
         study = _open(args, subjects, progress)
         problems = {subject.name: "" for subject in subjects if subject not in chosen}
@@ -137,23 +139,53 @@ def _other_units(study: Study, done: list[Subject]) -> dict[str, str]:
     }
 
 
+def _complete(args: argparse.Namespace) -> str:
+    """Replace omitted options by those of the study in the folder, or else by defaults; return a note about them."""
+    before = {} if args.replace else read_json(args.output / "study.json")
+    kept, taken = _options(before), []
+    # Comparable subjects need the same boundary condition, with or without a mask.
+    usual = {**vars(defaults(KEPT)), "boundary": "mean"}
+    for name in DEFAULTS:
+        if getattr(args, name) is None:
+            value = kept.get(name, usual[name])
+            setattr(args, name, [_spelled(name, value)] if name == "times" and value else value)
+            if value != usual[name] or (name == "boundary" and not before):
+                taken.append(f"{flag(name)} {_spelled(name, value)}")
+    origin = f"of the study in {args.output}" if before else "for all subjects"
+    return f"options {origin}: {', '.join(taken) or 'as given, or the defaults'}"
+
+
+def _options(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options in a study's record by their names in Python, with tuples in place of lists."""
+    if not record:
+        return {}
+    times = record["times"] if record["chosen"] == "explicit" else record["chosen"]
+    options = {"times": times, "time_unit": record["time-unit"], **record["settings"], **record["reading"]}
+    return {name.replace("-", "_"): tuples(value) for name, value in options.items()}
+
+
+def _spelled(name: str, value: Any) -> str:
+    """Return the value of an option as on the command line."""
+    if not isinstance(value, tuple):
+        return "unset" if value is None else str(value)
+    parts = [":".join(each) if isinstance(each, tuple) else str(each) for each in value if each is not None]
+    return {"slice": "=", "repair": ":", "positive": ":"}.get(name, ",").join(parts)
+
+
 def _open(args: argparse.Namespace, subjects: list[Subject], progress: StudyProgress) -> Study:
     """Return the study with explicit times and write its description; raise ValueError for another study's folder."""
     study = Study(args.output, Settings.of(args), args.time_unit, reading_options(args), args.save_pairs)
     times = study.settings.times
     before, chosen = read_json(args.output / "study.json"), "explicit" if times.explicit else f"auto:{times.automatic}"
-    now, then = study.record, dict(before)
-    if times.automatic:  # the times of an earlier run are kept
-        now["times"], then["times"] = chosen, before.get("chosen")
-    for part in ("settings", "reading"):
-        now |= now.pop(part)
-        then |= then.pop(part, {})
-    pairs = [(name, then.get(name), value) for name, value in now.items() if then.get(name) != value]
-    changed = "; ".join(f"--{name}: {json.dumps(old)}, now {json.dumps(new)}" for name, old, new in pairs)
+    now, then = _options({**study.record, "chosen": chosen}), _options(before)
+    if before and times.explicit:
+        then["times"] = tuples(before["times"])
+    changed = [name for name, value in now.items() if then.get(name) != value]
     if before and changed and not args.replace:
+        kept = "; ".join(f"{flag(n)} {_spelled(n, then.get(n))}, not {_spelled(n, now[n])}" for n in changed)
         raise ValueError(
-            f"--output: the study in {args.output} differs in {changed}. Choose another folder, or pass --replace to "
-            "compute the subjects of that study again"
+            f"--output: the study in {args.output} has {kept}. Leave these options out to continue the study, choose "
+            "another folder, or pass --replace to compute the subjects of that study again"
         )
     if times.automatic:
         explicit = _suitable(args, times.automatic, subjects, progress) if changed else tuple(before["times"])
@@ -184,18 +216,15 @@ def _suitable(
     return times
 
 
-class Range(NamedTuple):
-    """The range of times that suits one subject: voxels and eigenpairs limit it from below, the size from above."""
-
-    least: float
-    largest: float
+Range = tuple[float, float]
+"""The least and the largest time that suit a subject: voxels and eigenpairs limit the first, the size the second."""
 
 
 def suitable_range(volume: TensorVolume, args: argparse.Namespace) -> Range:
     """Estimate the range of times that suits a subject from its metric and its size, without eigenpairs."""
     of: dict[str, Any] = describe(args.file, volume, args.boundary)["suits"][args.metric or "tensor"]
     by_pairs = of["least_time_of_k"] * (1.0 if args.k is None else of["k"] / args.k) ** (2 / volume.dimension)
-    return Range(max(of["least_time"], by_pairs), of["largest_time"])
+    return max(of["least_time"], by_pairs), of["largest_time"]
 
 
 def common_times(ranges: Mapping[str, Range], n: int, unit: str) -> tuple[float, ...]:
@@ -204,14 +233,14 @@ def common_times(ranges: Mapping[str, Range], n: int, unit: str) -> tuple[float,
     For the unit ``"lambda1"``, the function returns products λ₁t; the largest product is `LAST`.
     """
     if unit == "lambda1":
-        ranges = {name: Range(LAST * least / most, LAST) for name, (least, most) in ranges.items()}
-    late, flat = max(ranges, key=lambda s: ranges[s].least), min(ranges, key=lambda s: ranges[s].largest)
-    least, largest = ranges[late].least, ranges[flat].largest
+        ranges = {name: (LAST * least / most, LAST) for name, (least, most) in ranges.items()}
+    late, small = max(ranges, key=lambda s: ranges[s][0]), min(ranges, key=lambda s: ranges[s][1])
+    least, largest = ranges[late][0], ranges[small][1]
     if least >= largest:
         raise ValueError(
-            f"--times: no time suits all subjects: {late} resolves only t ≥ {least:.3g}, and {flat} is nearly constant "
-            f"for t ≥ {largest:.3g}. Choose times, or more eigenpairs (-k). See 'hks-jax info' for {late}: tensors "
-            "with eigenvalues near zero need many eigenpairs (--repair nearest:1e-4)"
+            f"--times: no time suits all subjects: {late} resolves only t ≥ {least:.3g}, and the size of {small} "
+            f"allows only t ≤ {largest:.3g}. Choose times, or more eigenpairs (-k). See 'hks-jax info' for {late}: "
+            "tensors with eigenvalues near zero need many eigenpairs (--repair nearest:1e-4)"
         )
     return tuple(float(f"{t:.3g}") for t in np.geomspace(least, largest, n))
 

@@ -16,7 +16,7 @@ from hks_jax.cli import INPUT_ERRORS
 from hks_jax.cli.job import ComputationError, Solved, compute_pairs
 from hks_jax.cli.noise import signature_of
 from hks_jax.cli.pairs import are_of, read_pairs, write_pairs
-from hks_jax.cli.progress import StudyProgress, duration
+from hks_jax.cli.progress import StudyProgress
 from hks_jax.cli.reading import image_suffix, read_volume
 from hks_jax.cli.stats import region_table
 from hks_jax.cli.study.folder import MAP, PAIRS, REGIONS, Study
@@ -40,7 +40,7 @@ def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debu
     Several processes may work on the same study; the first process that starts a subject computes it. If another
     process restarts the study with other settings, this function raises ValueError.
     """
-    problems, begun = dict[str, str](), time.perf_counter()
+    problems = dict[str, str]()
 
     def failed(subject: Subject, error: Exception) -> None:
         if debug:
@@ -85,8 +85,7 @@ def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debu
             waiting = True
             time.sleep(PATIENCE)
         pending = elsewhere
-    done, spent = f"{len(subjects) - len(problems)} of {len(subjects)}", duration(time.perf_counter() - begun)
-    progress.end(f"{progress.line()}: {done} subjects are done, in {spent}")
+    progress.end(f"{len(subjects) - len(problems)} of {len(subjects)} subjects are done")
     return problems
 
 

@@ -3,12 +3,11 @@
 import base64
 import html
 import json
-import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -16,13 +15,14 @@ from jaxtyping import Bool, Real
 from matplotlib import colormaps
 
 from hks_jax import __version__
-from hks_jax.domain.grid import Grid
-from hks_jax.domain.simplicial_mesh import SurfaceMesh
-from hks_jax.plot.explore.layers import Layer, Regions, regions, scalar_layers, tensor_layers
+from hks_jax.domain.simplicial_mesh import SurfaceMesh, TetMesh
+from hks_jax.io import TensorVolume
+from hks_jax.io.result import Result
 from hks_jax.plot.orientation import LETTERS
 from hks_jax.plot.panels import checked_times
-from hks_jax.plot.signature import bounding_box
-from hks_jax.signatures.hks import Normalisation
+from hks_jax.plot.signature import METRICS, bounding_box
+from hks_jax.plot.volumes import middle_node
+from hks_jax.signatures.regions import region_statistics
 from hks_jax.storage import atomic_path
 
 SCRIPTS = ("data", "colours", "image", "mesh", "curves", "regions", "controls", "main")
@@ -33,23 +33,14 @@ LIMIT = 256 * 1024**2
 
 
 def explore(
-    values: Real[ArrayLike, "n_times *shape"],
-    times: Sequence[float] | Real[ArrayLike, " n_times"],
-    grid: Grid | SurfaceMesh,
+    result: Result,
     path: str | os.PathLike[str],
     *,
-    deviation: Real[ArrayLike, "n_times *shape"] | None = None,
-    tensors: Real[ArrayLike, "*shape d d"] | None = None,
     maps: Mapping[str, Any] | None = None,
     labels: Real[ArrayLike, "*shape"] | None = None,
     label_names: Mapping[int, str] | None = None,
-    normalisation: Normalisation = "raw",
     title: str = "Heat kernel signature",
-    facts: Mapping[str, Any] | None = None,
-    unit: str = "",
-    lengths: Sequence[float] | Real[ArrayLike, " n_times"] | None = None,
-    length_unit: str = "",
-    world: Real[ArrayLike, "3 d_and_1"] | None = None,
+    unit: str | None = None,
 ) -> Path:
     """Write an HTML page to explore a signature on a grid or a surface in any browser, without a network.
 
@@ -63,150 +54,168 @@ def explore(
     The file contains the numbers in single precision, with 5⅓ bytes for each inside node at each time and in each map.
 
     Args:
-        values: (n_times, *shape) the result of `hks_jax.hks`; nodes that are not finite are omitted. On a surface,
-            (n_times, V) finite values; (V,) then replaces (*shape) below.
-        times: (n_times,) in increasing order, positive.
-        grid: the 2D or 3D grid of the values, or the surface.
+        result: the signature at increasing times. Nodes that are not finite at all times are omitted; on a surface, all
+            must be finite. The normalisations ``"raw"`` and ``"flat"`` are shown as (4πt)^(d/2)·HKS, which is 1 for
+            flat space without boundary, with colours that diverge from 1. With ``arrays["deviation"]``, curves of
+            points have a band, and deviations from flat space or the mean within the noise fade. Tensors, if they are
+            known, are shown as mean eigenvalue, anisotropy and principal direction (red, green and blue for x, y and
+            z). With an affine, positions are shown in space, and the sides of images have the letters L and R, P and A,
+            I and S. For the metric D⁻¹, the distance √(Dt) is shown beside t.
         path: the file of the page; its folder is created.
-        deviation: (n_times, *shape) the values' standard deviation due to noise (`hks_jax.uncertainty`). Curves of
-            points then have a band, and deviations from flat space or the mean within the noise fade.
-        tensors: (*shape, d, d) measured tensors such as diffusivities, on grids only. The page shows their mean
-            eigenvalue, anisotropy and principal direction (as red, green and blue for x, y and z).
         maps: additional maps (*shape) by name.
         labels: (*shape) integers that define regions, 0 for none.
         label_names: the names of the labels.
-        normalisation: the normalisation of the values. ``"raw"`` and ``"flat"`` are shown as (4πt)^(d/2)·HKS, which is
-            1 for flat space without boundary, with colours that diverge from 1.
         title: the page's title.
-        facts: further facts about the data, by name.
-        unit: the unit of t.
-        lengths: (n_times,) the distance of heat spread at each time, such as √(Dt), which is shown beside t.
-        length_unit: the unit of lengths, in the grid or in `world`.
-        world: (3, d + 1), maps node indices to coordinates in space, with node 0 in the last column. Positions are then
-            shown in these coordinates. The sides of images have the letters L and R, P and A, I and S, for coordinates
-            that increase to the right, front and top, as in NIfTI.
+        unit: the unit of t, by default that of the result.
 
     Returns:
         The path.
 
     Raises:
-        ValueError: if shapes disagree, if times do not increase, if no node is finite, if the normalisation is unknown,
-            or if there are more numbers than a browser can open.
+        ValueError: if the result is on tetrahedra, if times do not increase, if no node is finite, if maps or labels
+            have another shape, or if there are more numbers than a browser can open.
 
     Examples:
-        >>> page = hj.plot.explore(hj.hks(pairs, [0.2, 0.5]), [0.2, 0.5], field.grid, folder / "page.html")
+        >>> volume = hj.io.TensorVolume(np.array(field.tensors), field.grid.spacing, field.grid.origin)
+        >>> result = hj.io.Result(volume, np.array(hj.hks(pairs, [0.2, 0.5])), np.array([0.2, 0.5]))
+        >>> page = hj.plot.explore(result, folder / "page.html")
         >>> page.read_text(encoding="utf-8")[:15]
         '<!doctype html>'
     """
-    shape, d = ((len(grid.vertices),), 2) if isinstance(grid, SurfaceMesh) else (grid.shape, grid.dimension)
-    t = checked_times(times, shape, values=values, deviation=deviation)
+    mesh, noise = result.place, result.arrays.get("deviation")
+    if isinstance(mesh, TetMesh):
+        raise ValueError(f"{result.source}: got a result on tetrahedra; expected a grid or a surface. Use ParaView")
+    t = checked_times(result.times, result.values.shape[1:], values=result.values, deviation=noise)
     if not (np.isfinite(t).all() and t[0] > 0 and (np.diff(t) > 0).all()):
-        raise ValueError(f"times: got {times}; expected positive numbers in increasing order")
-    if normalisation not in get_args(Normalisation):
-        raise ValueError(f"normalisation: got {normalisation!r}; expected one of {', '.join(get_args(Normalisation))}")
-    array: np.ndarray = np.asarray(values, dtype=np.float64)
-    inside, surface, place = np.isfinite(array).all(axis=0), {}, {}
-    if isinstance(grid, SurfaceMesh):
-        if not (inside.all() and tensors is None and world is None):
-            raise ValueError("values, tensors, world: got NaN, tensors or world for a surface; expected finite values")
-        surface = {"vertices": np.asarray(grid.vertices, "<f4"), "faces": grid.faces.astype("<i4")}
+        raise ValueError(f"times: got {t}; expected positive numbers in increasing order")
+    inside = np.isfinite(result.values).all(axis=0)
+    surface, place = {}, {}
+    if isinstance(mesh, SurfaceMesh):
+        if not inside.all():
+            raise ValueError("values: got NaN or infinite values on a surface; expected finite values")
+        surface = {"vertices": _base64(mesh.vertices, "<f4"), "faces": _base64(mesh.faces, "<i4")}
     else:
-        inside &= grid.inside
-        place = {"spacing": grid.spacing, "origin": grid.origin}
+        inside &= result.volume.inside
+        place = {"spacing": result.volume.spacing, "origin": result.volume.origin}
     if not inside.any():
         raise ValueError("values: got no node inside the mask with finite values at all times; expected at least one")
-    spread = None if lengths is None else np.asarray(lengths, dtype=np.float64)
-    if spread is not None and (spread.shape != t.shape or not np.isfinite(spread).all()):
-        raise ValueError(f"lengths: got shape {spread.shape}; expected {t.shape}, one finite number per time")
-    layers = [] if tensors is None else tensor_layers(tensors, inside)
-    layers += scalar_layers(maps or {}, inside)
-    noise = None if deviation is None else np.asarray(deviation, dtype=np.float64)
-    parts = None if labels is None else regions(labels, label_names, inside)
-    size = 4 * (int(inside.sum()) * t.size * (2 if noise is not None else 1) + sum(each.values.size for each in layers))
+    layers = {} if result.tensors is None else _tensor_layers(result.tensors, inside)
+    for name, values in (maps or {}).items():
+        if np.shape(values) != inside.shape:
+            raise ValueError(f"maps[{name!r}]: got shape {np.shape(values)}; expected the grid's shape {inside.shape}")
+        layers[name] = np.asarray(values)[inside]
+    size = 4 * (int(inside.sum()) * t.size * (2 if noise is not None else 1) + sum(map(np.size, layers.values())))
     if size > LIMIT:
         raise ValueError(
             f"values: {t.size} times at {int(inside.sum())} nodes take {size / 1024**2:.0f} MiB; expected at most "
             f"{LIMIT // 1024**2}, which a browser can open. Show fewer times, one slice, or part of the domain"
         )
-    flat = (4 * math.pi * t) ** (d / 2)
     # (4πt)^(d/2)·HKS is of order 1 in any unit, so float32 does not underflow.
-    scale = flat[:, None] if normalisation == "raw" else 1.0
-    shown = {"values": scale * array[:, inside]} | ({} if noise is None else {"deviation": scale * noise[:, inside]})
+    scale = result.flat_scale if result.normalisation == "raw" else 1.0
+    shown = {"values": (scale * result.values)[:, inside]}
+    if noise is not None:
+        shown["deviation"] = (scale * noise)[:, inside]
     box = bounding_box(inside, margin=0)
+    numbers = {"inside": _base64(inside[box], "u1")}
+    numbers |= {name: _base64(array, "<f4") for name, array in shown.items()}
+    numbers |= {f"layer-{i}": _base64(array, "<f4") for i, array in enumerate(layers.values())}
+    names: dict[int, str] = {}
+    if labels is not None:
+        numbers["labels"], names = _regions(labels, label_names, inside)
     about = {
         "title": title,
-        "facts": [[str(name), str(value)] for name, value in (facts or {}).items()],
+        "facts": [[name, str(value)] for name, value in _facts(result).items()],
         "software": f"hks-jax {__version__}",
-        "dimension": d,
+        "dimension": result.dimension,
         "mesh": bool(surface),
         "shape": inside[box].shape,
         "offset": [part.start for part in box],
         **place,
-        **_in_space(world, d),
-        "unit": unit,
-        "lengthUnit": length_unit,
+        **_in_space(result),
+        "unit": result.unit if unit is None else unit,
+        "lengthUnit": result.length_unit,
         "times": t.tolist(),
-        "lengths": None if spread is None else spread.tolist(),
-        "flat": flat.tolist(),
-        "normalisation": normalisation,
+        "lengths": None if result.lengths is None else result.lengths.tolist(),
+        "flat": result.flat_scale.ravel().tolist(),
+        "normalisation": result.normalisation,
         "noise": noise is not None,
-        "start": [0] if surface else _deep_node(inside[box]),
-        "layers": [{"name": layer.name, "kind": layer.kind} for layer in layers],
-        "labels": [] if parts is None else [[label, name] for label, name in parts.names.items()],
-        "colours": {name: _colour_table(colours) for name, colours in COLOURS.items()},
+        "start": [0] if surface else middle_node(inside[box]),
+        "layers": [
+            {"name": name, "kind": "scalar" if array.ndim == 1 else "direction"} for name, array in layers.items()
+        ],
+        "labels": list(names.items()),
+        "colours": {
+            name: _base64(255 * colormaps[of](np.arange(256))[:, :3] + 0.5, "u1") for name, of in COLOURS.items()
+        },
     }
-    page = _assemble(about, inside[box], shown, layers, parts, surface)
+    page = _assemble(about, numbers | surface)
     with atomic_path(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
     return Path(path)
 
 
-def _deep_node(inside: Bool[np.ndarray, "*shape"]) -> list[int]:
-    """Return the initial node, which is the node of the middle slice furthest from the boundary."""
-    from scipy import ndimage
+def _facts(result: Result) -> dict[str, Any]:
+    settings, place, facts = result.settings, result.place, dict[str, Any]()
+    if isinstance(place, TensorVolume):
+        facts["grid"] = " × ".join(map(str, place.shape))
+        facts |= {note[:5]: note[6:].partition(":")[0] for note in place.notes if note.startswith("slice ")}
+    else:
+        facts |= {"vertices": len(place.vertices), "triangles": len(place.triangulation.cells)}
+    if metric := settings.get("metric"):
+        facts["metric"] = METRICS[metric]
+    if boundary := settings.get("boundary"):
+        facts["boundary"] = boundary if isinstance(boundary, str) else json.dumps(boundary)
+    if result.eigenvalues.size and settings.get("method", "spectral") == "spectral":
+        facts["eigenpairs"] = len(result.eigenvalues)
+    return facts
 
-    depth = ndimage.distance_transform_edt(np.pad(inside, 1))[(slice(1, -1),) * inside.ndim]
-    if inside.ndim == 3:
-        middle = np.abs(np.arange(inside.shape[2]) - int(np.median(np.nonzero(inside)[2])))
-        depth = np.where(middle == 0, depth, -1.0)
-    return [int(i) for i in np.unravel_index(int(np.argmax(depth)), inside.shape)]
+
+def _tensor_layers(tensors: Real[ArrayLike, "*shape d d"], inside: Bool[np.ndarray, "*shape"]) -> dict[str, np.ndarray]:
+    """Return mean eigenvalue and anisotropy (n_nodes,) inside, and principal direction (n_nodes, 3) of this length."""
+    array, d = np.asarray(tensors, np.float64)[inside], inside.ndim
+    if not np.isfinite(array).all():
+        raise ValueError("tensors: got NaN or infinite values in the domain; exclude their nodes by the mask")
+    values, vectors = np.linalg.eigh((array + array.swapaxes(-1, -2)) / 2)
+    mean = values.mean(axis=-1)
+    spread = np.sqrt(np.sum(np.square(values - mean[:, None]), axis=-1))
+    # Both are 0 for multiples of the identity, and 1 if only one eigenvalue is nonzero.
+    size = np.abs(values.sum(axis=-1)) / np.sqrt(2) if d == 2 else np.sqrt(np.sum(values**2, axis=-1) / 1.5)
+    anisotropy = spread / np.where(size > 0, size, 1)
+    largest = np.argmax(np.abs(values), axis=-1)
+    direction = np.zeros((len(array), 3))
+    direction[:, :d] = anisotropy[:, None] * np.take_along_axis(vectors, largest[:, None, None], axis=2)[..., 0]
+    return {
+        "Mean eigenvalue (diffusivity)": mean,
+        "Anisotropy (λ₁ − λ₂)/(λ₁ + λ₂)" if d == 2 else "Fractional anisotropy": anisotropy,
+        "Principal direction": direction,
+    }
 
 
-def _in_space(world: Any, d: int) -> dict[str, Any]:
-    """Return the positions of the nodes, and the names of the grid's sides by the nearest world axes."""
-    if world is None:
+def _regions(
+    labels: Real[ArrayLike, "*shape"], names: Mapping[int, str] | None, inside: Bool[np.ndarray, "*shape"]
+) -> tuple[str, dict[int, str]]:
+    """Return the labels inside in base64, and the name or, without names, the number of each label that occurs."""
+    found = region_statistics(np.where(inside, 1.0, np.nan)[None], labels)
+    present = found.labels[found.nodes > 0].tolist()
+    known = {label: f"label {label}" for label in present} | dict(names or {})
+    return _base64(np.asarray(labels)[inside], "<i4"), {label: known[label] for label in present}
+
+
+def _in_space(result: Result) -> dict[str, Any]:
+    """Return the positions of the nodes in space, and the names of the grid's sides by the nearest axes of space."""
+    volume = result.place
+    if not isinstance(volume, TensorVolume) or volume.affine is None:
         return {"world": None, "ends": None}
-    matrix = np.asarray(world, dtype=np.float64)
-    if matrix.shape != (3, d + 1) or not np.isfinite(matrix).all():
-        raise ValueError(f"world: got shape {matrix.shape}; expected finite numbers (3, d + 1) = {(3, d + 1)}")
+    matrix = volume.affine[:3, [a for a in range(4) if volume.dimension == 3 or a != volume.thin_axis]]
     ends = []
-    for direction in matrix[:, :d].T:
+    for direction in matrix[:, :-1].T:
         axis = int(np.argmax(np.abs(direction)))
         ends.append(LETTERS[axis] if direction[axis] > 0 else LETTERS[axis][::-1])
     return {"world": matrix.tolist(), "ends": ends}
 
 
-def _colour_table(name: str) -> str:
-    colours = (255 * colormaps[name](np.linspace(0, 1, 256))[:, :3]).round().astype(np.uint8)
-    return _base64(colours)
-
-
-def _assemble(
-    about: dict[str, Any],
-    inside: Bool[np.ndarray, "*shape"],
-    shown: dict[str, np.ndarray],
-    layers: list[Layer],
-    parts: Regions | None,
-    surface: dict[str, np.ndarray],
-) -> str:
-    numbers = {
-        "inside": _base64(inside.astype(np.uint8)),
-        **{name: _base64(array.astype("<f4")) for name, array in shown.items()},
-    }
-    numbers |= {f"layer-{i}": _base64(layer.values.astype("<f4")) for i, layer in enumerate(layers)}
-    if parts is not None:
-        numbers["labels"] = _base64(parts.values.astype("<i4"))
-    numbers |= {name: _base64(array) for name, array in surface.items()}
+def _assemble(about: dict[str, Any], numbers: dict[str, str]) -> str:
+    """Return the page, whose scripts read the description and the numbers."""
     own = files(__package__)
     scripts = "\n".join((own / f"{name}.js").read_text(encoding="utf-8") for name in SCRIPTS)
     # "<" is escaped as JSON allows, so that no text can close its script element.
@@ -224,5 +233,5 @@ def _assemble(
     return "".join(filled[piece] if i % 2 else piece for i, piece in enumerate(pieces))
 
 
-def _base64(array: np.ndarray) -> str:
-    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii")
+def _base64(array: ArrayLike, dtype: str) -> str:
+    return base64.b64encode(np.asarray(array).astype(dtype).tobytes()).decode("ascii")
