@@ -28,7 +28,7 @@ from hks_jax.traced import is_traced
 OnFailure = Literal["nothing", "warning", "error"]
 """The action if the linear solves of a derivative do not converge, in addition to the result NaN."""
 
-_ON_HOST = 1 << 23
+_ON_HOST = 1 << 22
 """The largest size of the eigenvectors for which NumPy differentiates, as fast as JAX and without compilation."""
 
 

@@ -18,7 +18,7 @@ from hks_jax.linear.products import quadratic_forms
 from hks_jax.signatures.filters import Filter, mixing
 
 _matmul = partial(jnp.matmul, precision="highest")
-_ON_HOST = 1 << 23
+_ON_HOST = 1 << 22
 """The number of entries of the eigenvectors, and of all filters' matrices, up to which NumPy differentiates."""
 
 
