@@ -60,7 +60,7 @@ def nan_outside(
 
 
 def nan_is_meant(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorate a function that computes with values from `nan_outside`."""
+    """Return the function, without JAX's check for NaN; for functions of values from `nan_outside`."""
 
     @wraps(function)
     def run(*args: P.args, **kwargs: P.kwargs) -> R:

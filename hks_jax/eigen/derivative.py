@@ -206,8 +206,8 @@ def tangents_of(
     frame = with_transpose(onto_guards, onto_guards, force)
     if _solves(pencil, k, len(values)):
         # The force is zero on null vectors that every perturbation annihilates. In reverse mode, these rows are
-        # cotangents; then their solutions are set to zero. JAX would need the product with the matrix, here the
-        # identity, only for second derivatives.
+        # cotangents; then their solutions are set to zero. The identity stands for the product with the matrix,
+        # because JAX uses this product only for second derivatives.
         free = np.arange(k)[:, None] >= pencil.n_fixed
         rhs = jnp.where(free, -force, 0)
         frame = frame + jnp.where(free, jax.lax.custom_linear_solve(lambda x: x, rhs, solve, symmetric=True), 0)

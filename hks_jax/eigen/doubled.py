@@ -62,7 +62,7 @@ def _limits(pencil: MirrorPencil, total: int) -> list[int]:
 
 
 def _of_problem(report: Report, number: int, of: int) -> Report:
-    """Return a report that names the current problem, and estimates the time as if later problems took as long."""
+    """Return a report that names the current problem; it assumes that each later problem takes as long."""
     begin = time.perf_counter()
 
     def tell(text: str) -> None:

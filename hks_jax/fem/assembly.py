@@ -183,7 +183,7 @@ def _checked_operator(
             "the field in the form"
         )
     if (given or components > 1) and not own:
-        raise ValueError("fields, components: got them without your own form; pass stiffness= or mass= too")
+        raise ValueError("fields, components: these are for a form of your own; pass it as stiffness= or mass=")
     if components > 1 and stiffness is None:
         raise ValueError("stiffness: got None with components; expected a form for functions with several components")
     of_mass = mass if callable(mass) else l2

@@ -67,8 +67,8 @@ class Posterior(eqx.Module):
     Attributes:
         values: (*values) the standard deviations of the unknowns, in the parametrisation's units.
         tensors: (*shape, d, d) the standard deviations of the tensors' components.
-        unsolved: the largest relative residual of the linear systems of the draws.
-        sampling_error: the relative standard deviation of these deviations.
+        unsolved: the largest relative residual of the linear systems that were solved for the draws.
+        sampling_error: the relative standard error of the standard deviations, due to the number of draws.
     """
 
     values: Float[Array, "*values"]

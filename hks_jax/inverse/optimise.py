@@ -39,7 +39,7 @@ _objective = eqx.filter_custom_jvp(_half_squares)
 
 @_objective.def_jvp
 def _objective_jvp(primals: tuple, tangents: tuple) -> tuple:
-    """Compute the gradient with the value in order to report it; every solver that differentiates needs it."""
+    """Compute the gradient together with the value, so that it is reported; all solvers need it anyway."""
     (values, problem), (direction, _) = primals, tangents
     (value, outcome), gradient = jax.value_and_grad(_half_squares, has_aux=True)(values, problem)
     outcome = outcome._replace(gradient=jnp.linalg.norm(jnp.ravel(gradient)))

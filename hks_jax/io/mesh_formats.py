@@ -88,7 +88,7 @@ def _compare(content: bytes, suffix: str, declared: tuple[int, ...], mesh: Any) 
     if lists is not None:  # before version 5, the declared number also counts one entry per cell
         listed = int(lists[2]) - (0 if re.match(rb"# vtk DataFile Version [5-9]", content) else counts[1])
         if listed != corners:  # if a cell's type is wrong, meshio omits corners
-            raise ValueError(f"the file declares {listed} corners of cells; expected {corners} from the cells' types")
+            raise ValueError(f"the file lists {listed} corners of cells; their types have {corners} corners")
     if suffix == ".ply":
         _compare_ply(content, mesh)
 
@@ -198,7 +198,7 @@ def fans(
     if bad.size:
         which = bad[0] if numbers is None else numbers[bad[0]]
         raise ValueError(
-            f"{file}: face {which} with {size} corners is not star-shaped about a corner. Cut it into triangles"
+            f"{file}: face {which} with {size} corners is not star-shaped about any corner. Cut it into triangles"
         )
     return found
 

@@ -107,7 +107,7 @@ class PatternedOperator(Operator):
         starts = np.flatnonzero((np.diff(rows, prepend=-2) != 1) | (np.diff(cols, prepend=-2) != 1))
         if where.size > _RUN * starts.size:  # along an axis of a grid, rows and columns advance together
             runs = zip(rows[starts], cols[starts], starts, np.diff(starts, append=where.size), strict=True)
-            for i, j, start, n in sorted(runs):  # in the order of rows, whose vectors stay in the cache
+            for i, j, start, n in sorted(runs):  # by rows, so that parts of p and x stay in the cache
                 np.einsum("bi,bi->i", p[:, i : i + n], x[:, j : j + n], out=entries[start : start + n])
         else:
             p, x = np.ascontiguousarray(p.T), np.ascontiguousarray(x.T)

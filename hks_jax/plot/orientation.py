@@ -59,7 +59,7 @@ class Orientation(NamedTuple):
         """
         matrix = np.asarray(affine, dtype=np.float64)
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or np.linalg.det(matrix[:3, :3]) == 0:
-            raise ValueError(f"affine: got shape {matrix.shape}; expected finite (4, 4) with independent axes")
+            raise ValueError(f"affine: got shape {matrix.shape}; expected a finite (4, 4) matrix with independent axes")
         if slice_axis not in (None, 0, 1, 2):
             raise ValueError(f"slice_axis: got {slice_axis}; expected 0, 1, 2, or None for a volume")
         if view not in get_args(View):

@@ -201,7 +201,8 @@ def _least_kernels(
     residuals = jnp.sum(weights * jnp.where(pairs.kept, pairs.residuals, 0)[None], axis=1) / jnp.sum(weights, axis=1)
     error = MARGIN * truncation(pairs, times).tail + residuals + 100 * jnp.finfo(times.dtype).eps
     at_nodes = jnp.where(space.free, jnp.square(resolution.mesh_width), 0)
-    # The spacing along the geodesic is not known. Use the spacing at its ends, or the domain's mean if it is larger.
+    # The spacing along the geodesic is not known. Use the larger of two values: the spacing at its
+    # ends, and the mean spacing of the domain.
     along = jnp.maximum(
         jnp.maximum(at_nodes[None], _broadcast(at_nodes.ravel()[nodes], space)), jnp.sum(at_nodes) / space.n_dof
     )
@@ -224,6 +225,6 @@ def _warn_of_distance(
         remedy = "more eigenpairs (in float64)" if 2 * too_small.sum() >= far.sum() else "a finer grid"
         warn_of_accuracy(
             f"times: {far.mean():.1%} of the distances are NaN, {far[worst].mean():.1%} at t = "
-            f"{float(times[worst]):.4g}, because the heat kernel is not resolved so far from a source. Use larger "
+            f"{float(times[worst]):.4g}, because the heat kernel is not resolved at such distances. Use larger "
             f"times or {remedy}"
         )

@@ -266,7 +266,7 @@ def boundary_influence(
     """
     if isinstance(domain, Eigenpairs):
         if k is not None or boundary != "neumann":
-            raise ValueError("k, boundary: got values for eigenpairs, which determine both; omit these arguments")
+            raise ValueError("k, boundary: eigenpairs already determine both; omit these arguments")
         if len(domain.pencil.parts) != 2:
             raise ValueError('domain: got eigenpairs of another boundary; compute them with boundary="mean"')
         times = resolved_times(domain, times)

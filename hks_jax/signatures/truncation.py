@@ -207,7 +207,7 @@ def _estimated(pairs: Eigenpairs, times: Any) -> tuple[Eigenpairs, Float[Array, 
     """Return pairs and times as constants to derivatives; raise ValueError if the pairs allow no estimate."""
     at = times_of(pairs, times)
     if not pairs.lowest:
-        raise ValueError("pairs: got eigenpairs in an interval; expected the lowest, which allow an estimate")
+        raise ValueError("pairs: got eigenpairs in an interval; truncation can be estimated only for the lowest")
     return jax.lax.stop_gradient((pairs, at))
 
 

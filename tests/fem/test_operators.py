@@ -363,7 +363,7 @@ def first_order(u, v, w):
         ({"stiffness": first_order, "potential": 1.0}, "potential: got a field with your own form"),
         ({"stiffness": "laplace"}, "stiffness: got str; expected a form"),
         ({"mass": "full"}, 'mass: got \'full\'; expected "consistent", "lumped" or a form'),
-        ({"fields": {"a": 1.0}}, "got them without your own form"),
+        ({"fields": {"a": 1.0}}, "these are for a form of your own"),
         ({"stiffness": elasticity, "components": 2, "boundary": "mirror"}, 'got "mirror" with components'),
         ({"degree": 2}, "degree, midpoints: got 2 for a grid"),
     ],

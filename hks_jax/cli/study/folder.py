@@ -187,7 +187,7 @@ class Study:
 
 
 def reading_options(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the options for reading and noise by name, with "file" for a second scan, whose path may change."""
+    """Return the options for reading and noise by name. "file" replaces the path of a second scan, which may change."""
     names = [option for option in COLUMNS if args.noise is not None or option not in ("noise", "draws")]
     reading = {option: getattr(args, option.replace("-", "_")) for option in names}
     return reading if second_scan(args) is None else {**reading, "noise": "file"}
