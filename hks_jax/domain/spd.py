@@ -76,7 +76,8 @@ def is_spd(tensors: np.ndarray) -> np.ndarray:
     """Mark the matrices (..., d, d) that are finite and positive definite (Sylvester's criterion, on the host)."""
     t = np.asarray(tensors, dtype=np.float64)
     finite = np.isfinite(t).all(axis=(-2, -1), keepdims=True)
-    return _positive(np.where(finite, t, 0.0))
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _positive(np.where(finite, t, 0.0))
 
 
 def _positive(t: Any) -> Any:

@@ -62,6 +62,7 @@ def test_rows_far_from_their_shift_converge():
     data, matrices = host_matrices(pencil)
     stiffness, mass = matrices(*data)
 
+    @jax.jit
     def matrices_of(tensors):
         assembled = hj.assemble(hj.TensorField(grid, tensors))
         return assembled.stiffness, assembled.mass

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array
 
 from hks_jax.checks import require_count
+from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.complement import adjoint as complement
 from hks_jax.eigen.complement.adjoint import Adjoint, Columns, Rows, Scalar, Values, Vectors
 from hks_jax.eigen.filter.polynomial import Band, correction, upper_end
@@ -55,6 +56,7 @@ class FilteredAdjoint(Adjoint[Pencil]):
             raise ValueError("adjoint: got FilteredAdjoint, which needs a grid; use FactorisedAdjoint for a mesh")
         return upper_end(nodal_pencil(pencil))
 
+    @jit_quickly()
     def solve(self, prepared: Scalar, pencil: Pencil, values: Values, vectors: Vectors, rhs: Rows) -> Rows:
         """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`."""
         space, nodal, high = pencil.space, nodal_pencil(pencil), prepared
