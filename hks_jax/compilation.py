@@ -218,12 +218,9 @@ def _is_inexact(leaf: Any) -> bool:
     return jax.dtypes.issubdtype(jax.typeof(leaf).dtype, np.inexact)
 
 
-def _call(function: Callable[..., Any], *leaves: Any) -> Any:
+@jit_quickly(static_argnums=0)
+def _call(function: Any, *leaves: Any) -> Any:
     return function(*leaves)
-
-
-_usual = jax.jit(_call, static_argnums=0)
-_quick = jax.jit(_call, static_argnums=0, compiler_options=_OPTIONS)
 
 
 def _apply(rule: NumPyRule | None, known: Sequence[Any], *others: list[Any] | None) -> Any:
@@ -236,7 +233,7 @@ def _apply(rule: NumPyRule | None, known: Sequence[Any], *others: list[Any] | No
 def _computed(function: _Program | _LinearMap, *leaves: Any) -> Any:
     with jax.core.eval_context():
         found = function.by_numpy(*leaves)
-        return found if found is not None else (_quick if _understood() else _usual)(function, *leaves)
+        return _call(function, *leaves) if found is None else found
 
 
 def _shapes(leaves: Sequence[Any]) -> tuple[jax.ShapeDtypeStruct, ...]:

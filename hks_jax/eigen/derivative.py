@@ -77,7 +77,7 @@ def _solved_jvp(
     spare = max(extra, min(sides * solver.guards(k, n_dof), min(solver.max_pairs(n_dof), n_dof) - k))
     values, vectors, complete_below = _computed(solver, pencil, k, spare, interior, report)
     adjoint = InteriorAdjoint(solver.adjoint.tolerance) if interior else solver.adjoint
-    # Many products with one Jacobian share what is prepared.
+    # The preparation does not depend on the change, so that all products with one Jacobian share it.
     prepared = one_by_one(_prepare, (adjoint, k), pencil, values) if _solves(pencil, k, len(values)) else None
     if isinstance(pencil, Pencil) and pencil.metric is not None:
         # Reverse mode stores all arrays of the arguments, but only estimates need the metric.

@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -72,16 +73,20 @@ class Operator(eqx.Module):
             raise ValueError(f"@: got an array of shape {x.shape}; expected ({self.size},) or ({self.size}, m)")
         return self.apply(x.T).T
 
-    @jax.jit
     def to_dense(self) -> Float[Array, "n_dof n_dof"]:
         """Return the full matrix."""
-        data, places = self.triplets()
-        return jnp.zeros(self.shape, data.dtype).at[places].add(data)
+        return _scattered(*self.triplets(), self.shape)
 
     def to_scipy(self) -> csc_matrix:
         """Return the matrix as SciPy CSC, on the host."""
         data, places = self.triplets()
         return coo_matrix((np.asarray(data), places), shape=self.shape).tocsc()
+
+
+# The places are arguments, so that another pattern of the same size needs no compilation.
+@partial(jax.jit, static_argnames="shape")
+def _scattered(data: Float[Array, " nnz"], places: Any, shape: tuple[int, int]) -> Float[Array, "rows cols"]:
+    return jnp.zeros(shape, data.dtype).at[places].add(data)
 
 
 class PatternedOperator(Operator):
