@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from hks_jax.arrays import StaticArray, describe_array
 from hks_jax.checks import real_array
+from hks_jax.compilation import numpy_where_known
 from hks_jax.domain import spd
 from hks_jax.domain.simplices import WORDS, check_metric, check_places, checked_cells, checked_mask
 from hks_jax.domain.tensor_checks import (
@@ -20,6 +21,7 @@ from hks_jax.domain.tensor_checks import (
     require_spd,
 )
 from hks_jax.domain.triangulation import Triangulation
+from hks_jax.linear.products import matmul
 from hks_jax.traced import is_traced
 
 Mesh = TypeVar("Mesh", bound="SimplicialMesh")
@@ -106,22 +108,13 @@ class SimplicialMesh(eqx.Module):
     @property
     def metric(self) -> Float[Array, "n d d"]:
         """The metric of each cell in the basis of its edges v₁ − v₀, v₂ − v₀ …; NaN if not positive definite."""
-        given, edges = self._metric, self._edges
-        induced = jnp.einsum("nxa,nxb->nab", edges, edges, precision="highest") if given is None else given
-        return spd.positive_or_nan(induced)
+        given = self._metric
+        return spd.positive_or_nan(_induced_metric(self._edges) if given is None else given)
 
     @property
     def _edges(self) -> Float[Array, "n 3 d"]:
         """The edges v₁ − v₀, v₂ − v₀ … of each cell, as columns; NaN for inverted tetrahedra."""
-        corners = self.vertices[self.triangulation.cells]
-        return self._oriented(jnp.swapaxes(corners[:, 1:] - corners[:, :1], -1, -2))
-
-    def _oriented(self, frames: Float[Array, "*n 3 d"]) -> Float[Array, "*n 3 d"]:
-        """Return the frames ∂x/∂ξ of cells, with NaN in place of those of inverted tetrahedra."""
-        if self.triangulation.dimension == 2:
-            return frames
-        positive = jnp.linalg.det(frames) > 0
-        return frames * jnp.where(positive, 1, jnp.nan).astype(frames.dtype)[..., None, None]
+        return _edges_of(self.vertices, self.triangulation.cells)
 
 
 class SurfaceMesh(SimplicialMesh):
@@ -229,29 +222,51 @@ def _metric_of_tensors(
     if not is_traced((array, edges)):
         _check_tensors(np.asarray(array), np.asarray(edges), triangulation, at_vertices)
     corners = triangulation.cells if at_vertices else np.arange(len(array))[:, None]
-    frames = _orthonormal(edges)
-    parts = jnp.einsum("nxa,ncxy,nyb->ncab", frames, spd.symmetrise(array)[corners], frames, precision="highest")
+    return _tangential_metric(edges, array, corners, metric, interpolation if at_vertices else "linear")
+
+
+@numpy_where_known(static_argnums=(3, 4))
+def _tangential_metric(
+    xp: Any, edges: Any, tensors: Any, corners: Any, metric: MetricChoice, interpolation: Interpolation
+) -> Any:
+    """Return the metric of cells with edges (n, 3, d), from tensors in space at their corners (n, c)."""
+    frames, symmetric = _orthonormal(xp, edges), 0.5 * (tensors + xp.swapaxes(tensors, -1, -2))
+    across = xp.swapaxes(frames, -1, -2)
+    parts = matmul(across[:, None], symmetric[corners], frames[:, None])
     # The tensors at all vertices of a cell, and not only their mean, must be positive definite.
-    parts = spd.positive_or_nan(parts)
+    parts = spd.nan_unless(xp, spd.is_positive(parts), parts)
     # The logarithm is that of the tangential part, since tensors may be indefinite across a surface.
-    if interpolation == "linear" or not at_vertices:
-        part = jnp.mean(parts, axis=1)
-    else:
-        part = spd.exp(jnp.mean(spd.log(parts), axis=1))
-    if metric != "tensor":
-        part = spd.inverse(part) if metric == "inverse" else spd.adjugate(part)
-    coordinates = jnp.einsum("nxa,nxb->nab", frames, edges, precision="highest")
-    return jnp.einsum("nab,nac,ncd->nbd", coordinates, part, coordinates, precision="highest")
+    mean = xp.mean(parts, axis=1) if interpolation == "linear" else spd.exp(jnp.mean(spd.log(parts), axis=1))
+    coordinates = matmul(across, edges)
+    return matmul(xp.swapaxes(coordinates, -1, -2), spd.metric_of_diffusion(mean, metric), coordinates)
 
 
-def _orthonormal(edges: Float[Array, "n 3 d"]) -> Float[Array, "n 3 d"]:
+@numpy_where_known()
+def _edges_of(xp: Any, vertices: Any, cells: Any) -> Any:
+    """Return the edges v₁ − v₀, v₂ − v₀ … of each cell, as columns; NaN for inverted tetrahedra."""
+    corners = vertices[cells]
+    return oriented(xp, xp.swapaxes(corners[:, 1:] - corners[:, :1], -1, -2))
+
+
+@numpy_where_known()
+def _induced_metric(xp: Any, edges: Any) -> Any:
+    """Return the inner products of the edges of each cell."""
+    return matmul(xp.swapaxes(edges, -1, -2), edges)
+
+
+def oriented(xp: Any, frames: Any) -> Any:
+    """Return the frames ∂x/∂ξ (..., 3, d) of cells, with NaN in place of those of inverted tetrahedra."""
+    return frames if frames.shape[-1] == 2 else spd.nan_unless(xp, spd.determinant(frames) > 0, frames)
+
+
+def _orthonormal(xp: Any, edges: Any) -> Any:
     """Return an orthonormal basis, as columns, of each triangle's plane by Gram–Schmidt, or of space."""
     if edges.shape[-1] == 3:
-        return jnp.broadcast_to(jnp.eye(3, dtype=edges.dtype), edges.shape)
+        return xp.broadcast_to(xp.eye(3, dtype=edges.dtype), edges.shape)
     first, second = edges[..., 0], edges[..., 1]
-    first = first / jnp.linalg.norm(first, axis=-1, keepdims=True)
-    second = second - jnp.sum(first * second, axis=-1, keepdims=True) * first
-    return jnp.stack([first, second / jnp.linalg.norm(second, axis=-1, keepdims=True)], axis=-1)
+    first = first / xp.linalg.norm(first, axis=-1, keepdims=True)
+    second = second - xp.sum(first * second, axis=-1, keepdims=True) * first
+    return xp.stack([first, second / xp.linalg.norm(second, axis=-1, keepdims=True)], axis=-1)
 
 
 def _place(shape: tuple[int, ...], triangulation: Triangulation, at: str | None) -> str:

@@ -63,6 +63,11 @@ def inverse(tensors: Any) -> Any:
     return adjugate(tensors) / determinant(tensors)[..., None, None]
 
 
+def metric_of_diffusion(tensors: Any, metric: str) -> Any:
+    """Return the metric of diffusion tensors D in JAX or NumPy: ``"inverse"``, ``"adjugate"``, or ``"tensor"``: D."""
+    return tensors if metric == "tensor" else inverse(tensors) if metric == "inverse" else adjugate(tensors)
+
+
 def cholesky(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
     """Return the lower triangular L with T = LLᵀ; NaN for matrices that are not positive definite."""
     d, factor = tensors.shape[-1], jnp.zeros_like(tensors)
@@ -77,18 +82,24 @@ def is_spd(tensors: np.ndarray) -> np.ndarray:
     t = np.asarray(tensors, dtype=np.float64)
     finite = np.isfinite(t).all(axis=(-2, -1), keepdims=True)
     with np.errstate(over="ignore", invalid="ignore"):
-        return _positive(np.where(finite, t, 0.0))
+        return is_positive(np.where(finite, t, 0.0))
 
 
-def _positive(t: Any) -> Any:
+def is_positive(t: Any) -> Any:
+    """Mark the matrices (..., d, d) of JAX or NumPy that are positive definite, by Sylvester's criterion."""
     return (t[..., 0, 0] > 0) & (determinant(t[..., :2, :2]) > 0) & (determinant(t) > 0)
 
 
-# Sylvester's criterion, as a product and not as `where(…)`, so that derivatives are NaN too.
-@jax.jit
-def positive_or_nan(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
+@numpy_where_known()
+def positive_or_nan(xp: Any, tensors: Any) -> Any:
     """Return the matrices, d = 2 or 3, with NaN in place of those that are not positive definite."""
-    return tensors * jnp.where(_positive(tensors), 1, jnp.nan).astype(tensors.dtype)[..., None, None]
+    return nan_unless(xp, is_positive(tensors), tensors)
+
+
+# A product and not `where(…)`, so that derivatives are NaN too.
+def nan_unless(xp: Any, valid: Any, matrices: Any) -> Any:
+    """Return the matrices (..., i, j) of JAX or NumPy, with NaN in place of those that are not ``valid``."""
+    return matrices * xp.where(valid, 1, xp.nan).astype(matrices.dtype)[..., None, None]
 
 
 # If tr S = 0, the Cayley–Hamilton theorem gives S² = qI (d = 2) or S³ = pS + |S| I (d = 3). So exp S is a

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from hks_jax.arrays import describe_array
 from hks_jax.checks import real_array
+from hks_jax.compilation import numpy_where_known
 from hks_jax.domain import spd
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_checks import (
@@ -125,9 +126,7 @@ class TensorField(eqx.Module):
         tensors = spd.symmetrise(_checked_tensors(name, grid, D))
         if metric == "tensor":
             return cls._checked(grid, interpolation, tensors)
-        # This comes first, since in three dimensions −D and D have the same adjugate.
-        tensors = spd.positive_or_nan(spd.identity_outside(tensors, grid.inside))
-        return cls(grid, spd.inverse(tensors) if metric == "inverse" else spd.adjugate(tensors), interpolation)
+        return cls(grid, _metric_of_diffusion(spd.identity_outside(tensors, grid.inside), metric), interpolation)
 
     @classmethod
     def from_deformation(
@@ -218,6 +217,12 @@ class TensorField(eqx.Module):
     def domain_tensors(self) -> Float[Array, "*shape d d"]:
         """The tensors for computations: the identity outside the mask, NaN if a tensor is not positive definite."""
         return spd.positive_or_nan(spd.identity_outside(self.tensors, self.grid.inside))
+
+
+@numpy_where_known(static_argnums=1)
+def _metric_of_diffusion(xp: Any, D: Any, metric: MetricChoice) -> Any:
+    # In three dimensions −D and D have the same adjugate, so tensors that are not positive definite become NaN first.
+    return spd.metric_of_diffusion(spd.nan_unless(xp, spd.is_positive(D), D), metric)
 
 
 def _evaluate(function: jtu.Partial, grid: Grid) -> Float[Array, "*shape_and_components"]:

@@ -14,7 +14,7 @@ from hks_jax.checks import real_array
 from hks_jax.compilation import jit_quickly
 from hks_jax.domain import spd
 from hks_jax.domain.grid import Grid
-from hks_jax.domain.simplicial_mesh import SimplicialMesh
+from hks_jax.domain.simplicial_mesh import SimplicialMesh, oriented
 from hks_jax.domain.tensor_checks import Interpolation
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.elements import MASS, Element, element_matrices, moved, simplex_element, tensor_product_element
@@ -262,7 +262,7 @@ def assemble_mesh(
     shape = len(space.cells), element.weights.size
     if curved:
         slopes = jnp.asarray(element.gradients, nodes.dtype)
-        frames = mesh._oriented(jnp.einsum("qia,nix->nqxa", slopes, nodes[space.cells], precision="highest"))
+        frames = oriented(jnp, jnp.einsum("qia,nix->nqxa", slopes, nodes[space.cells], precision="highest"))
         metric = spd.positive_or_nan(jnp.einsum("nqxa,nqxb->nqab", frames, frames, precision="highest"))
     else:
         metric, frames = (jnp.broadcast_to(x[:, None], (*shape, *x.shape[1:])) for x in (mesh.metric, mesh._edges))

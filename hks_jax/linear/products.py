@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from functools import partial, reduce
 from operator import add
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -37,9 +38,10 @@ def inner_products(basis: Float[Array, "m n"], block: Float[Array, "b n"]) -> Fl
     return jax.lax.optimization_barrier(products_with_columns(basis, block.T).T)
 
 
-def matmul(*factors: Inexact[Array, "*batch _ _"]) -> Inexact[Array, "*batch _ _"]:
-    """Return the product of (batches of) matrices, on every device in the full precision of their dtype."""
-    return reduce(partial(jnp.matmul, precision="highest"), factors)
+def matmul(*factors: Any) -> Any:
+    """Return the product of (batches of) matrices of JAX or NumPy, on every device in the precision of their dtype."""
+    by_numpy = all(isinstance(factor, np.ndarray) for factor in factors)
+    return reduce(np.matmul if by_numpy else partial(jnp.matmul, precision="highest"), factors)
 
 
 def batched_with_columns(matrices: Float[Array, "m i j"], columns: Float[Array, "m j b"]) -> Float[Array, "m i b"]:
