@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hks_jax.traced import is_staged
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -41,6 +43,11 @@ class StaticArray(ByKey):
 
     def __repr__(self) -> str:
         return f"StaticArray({self.value.dtype}{list(self.value.shape)})"
+
+
+def jax_array(value: Any) -> Array:
+    """Return a JAX array, as `jnp.asarray` does, which compiles a program for every shape of NumPy arrays."""
+    return jax.device_put(value) if isinstance(value, np.ndarray) and not is_staged() else jnp.asarray(value)
 
 
 def describe_array(value: Any) -> str:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hks_jax.arrays import jax_array
 from hks_jax.traced import is_traced
 
 
@@ -40,12 +41,18 @@ def require_real(name: str, values: Any) -> None:
         )
     if any(isinstance(leaf, np.ndarray) and leaf.dtype.kind == "f" and leaf.dtype.itemsize > 8 for leaf in leaves):
         raise ValueError(f"{name}: got {np.dtype(np.longdouble)}, which JAX does not support; use .astype(np.float64)")
+    if any(isinstance(leaf, np.ma.MaskedArray) and np.ma.is_masked(leaf) for leaf in leaves):
+        raise ValueError(
+            f"{name}: got a masked array; expected an array whose values are all known; use .filled(value)"
+        )
 
 
 def real_array(name: str, values: Any) -> Array:
     """Return a floating-point array unchanged, or integers as floats of default precision, after `require_real`."""
     require_real(name, values)
-    array = jnp.asarray(values)
+    if isinstance(values, np.ndarray):
+        values = values.astype(values.dtype.newbyteorder("="), copy=False)
+    array = jax_array(values)
     return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(jnp.result_type(float))
 
 
@@ -63,7 +70,8 @@ def checked_times(times: Any, dtype: Any) -> Float[Array, " n"]:
     """Return times as an array (n,); raise ValueError unless they are 1-D, positive and finite."""
     require_real("times", times)
     try:
-        array = jnp.asarray(times, dtype)
+        is_array = isinstance(times, jax.Array) or is_traced(times)
+        array = jnp.asarray(times, dtype) if is_array else jax_array(np.asarray(times, dtype))
     except (TypeError, ValueError):
         raise ValueError(f"times: got {times!r}; expected a 1-D array of positive numbers") from None
     if array.ndim != 1 or array.size == 0:

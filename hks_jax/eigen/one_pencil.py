@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
+from hks_jax.arrays import jax_array
 from hks_jax.checks import require_count
 from hks_jax.compilation import is_concrete_on_cpu, jit_quickly, numpy_where_known
 from hks_jax.eigen.complement.adjoint import Scalar
@@ -170,18 +171,16 @@ def _pairs(
         quality = jnp.zeros(0, values.dtype), no, no, jnp.asarray(1e-6, values.dtype)
     residuals, converged, zero, tolerance = quality
     # While differentiating, JAX may turn a constant array into a Python number.
-    following, bound = jnp.asarray(following), jnp.asarray(bound)
+    following, bound = jax_array(following), jax_array(bound)
     if not known:
-        # Eigenvalues that are zero within rounding become exactly zero, and keep their derivatives.
-        values = values + origin + jax.lax.stop_gradient(jnp.where(zero, -values - origin, 0))
-        following, bound = following + origin, bound + origin
+        values, following, bound = _translated(values, jax.lax.stop_gradient(values), zero, following, bound, origin)
     return Eigenpairs(
         values,
         vectors,
         frame,
         residuals,
         converged,
-        kept=jnp.asarray(np.ones(values.size, bool)),
+        kept=jax_array(np.ones(values.size, bool)),
         part=None,
         next_eigenvalue=following,
         complete_below=bound,
@@ -191,6 +190,14 @@ def _pairs(
         solver_name=solver.name,
         lowest=lowest,
     )
+
+
+@numpy_where_known(jit_quickly())
+def _translated(
+    xp: Any, values: Any, constant: Any, zero: Any, following: Any, bound: Any, origin: Any
+) -> tuple[Any, Any, Any]:
+    """Add the origin to values and bounds. Zero eigenvalues become exactly zero, and keep their derivatives."""
+    return values + origin + xp.where(zero, -constant - origin, 0), following + origin, bound + origin
 
 
 @numpy_where_known(jit_quickly(static_argnames=("n_null", "tolerance", "known")), most=3 << 18)

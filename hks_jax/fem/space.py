@@ -81,7 +81,7 @@ class FunctionSpace(ByKey):
 
     def restrict(self, nodal: Float[Array, "*leading_and_node_shape"]) -> Float[Array, "... n_dof"]:
         """Return the values at the free nodes."""
-        flat = jnp.reshape(nodal, (*nodal.shape[: nodal.ndim - len(self.node_shape)], self.free.size))
+        flat = _reshaped(nodal, (*nodal.shape[: nodal.ndim - len(self.node_shape)], self.free.size))
         return flat if self._all_free else taken(flat, self._free_indices)
 
     def extend(
@@ -90,14 +90,18 @@ class FunctionSpace(ByKey):
         """Put values at the free nodes, zero at Dirichlet nodes, and ``outside`` at nodes outside the domain."""
         shape = (*values.shape[:-1], *self.node_shape)
         if self._all_free:
-            return values.reshape(shape)
+            return _reshaped(values, shape)
         fill = np.where(self.domain.ravel(), 0.0, outside).astype(values.dtype)
         with jax.debug_nans(False):  # NaN is intended outside the domain
-            return _spread(values, self._free_indices, fill).reshape(shape)
+            return _reshaped(_spread(values, self._free_indices, fill), shape)
 
     def transfer(self, values: Float[Array, "... n_dof"], to: "FunctionSpace") -> Float[Array, "... n"]:
         """Return functions of this space as functions of another one on the same nodes, zero at its Dirichlet nodes."""
         return values if to == self else to.restrict(self.extend(values, outside=0.0))
+
+
+def _reshaped(values: Array, shape: tuple[int, ...]) -> Array:
+    return by_numpy(lambda known: known.reshape(shape), values) if _by_numpy(values) else jnp.reshape(values, shape)
 
 
 def taken(values: Float[Array, "... n"], indices: Int[np.ndarray, " m"]) -> Float[Array, "... m"]:

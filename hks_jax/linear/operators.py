@@ -71,7 +71,7 @@ class Operator(eqx.Module):
         """Multiply a vector (n_dof,) or a block of columns (n_dof, m)."""
         if x.ndim not in (1, 2) or x.shape[0] != self.size:
             raise ValueError(f"@: got an array of shape {x.shape}; expected ({self.size},) or ({self.size}, m)")
-        return self.apply(x.T).T
+        return _product(self, x)
 
     def to_dense(self) -> Float[Array, "n_dof n_dof"]:
         """Return the full matrix."""
@@ -81,6 +81,11 @@ class Operator(eqx.Module):
         """Return the matrix as SciPy CSC, on the host."""
         data, places = self.triplets()
         return coo_matrix((np.asarray(data), places), shape=self.shape).tocsc()
+
+
+@jit_quickly()
+def _product(operator: Operator, x: Float[Array, "n_dof *m"]) -> Float[Array, "n_dof *m"]:
+    return operator.apply(x.T).T
 
 
 # The places are arguments, so that another pattern of the same size needs no compilation.

@@ -79,7 +79,7 @@ def _n_positive(pairs: Eigenpairs) -> int:
     """Return the number of kept eigenvalues that are positive, or an upper bound for traced values."""
     values, kept = jax.lax.stop_gradient((pairs.eigenvalues, pairs.kept))
     if not is_traced((values, kept)):
-        return int((kept & (values > 0)).sum())
+        return int((np.asarray(kept) & (np.asarray(values) > 0)).sum())
     return pairs.k - pairs.n_null if pairs.null_space_known else pairs.k
 
 

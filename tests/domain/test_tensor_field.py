@@ -37,6 +37,17 @@ def test_field_is_a_pytree_through_jit_grad_vmap(rng):
     np.testing.assert_allclose(batch, [volume(field), 4 * volume(field)], rtol=1e-13)
 
 
+def test_arrays_of_other_byte_order_are_read_and_hidden_values_are_refused(rng):
+    grid, tensors = hj.Grid((4, 5)), random_spd(rng, (4, 5))
+    given = tensors.astype(">f8")
+    field = hj.TensorField(grid, given)
+    given[:] = 0  # the field has its own copy
+    np.testing.assert_allclose(field.tensors, tensors, atol=1e-15)
+    hidden = np.ma.masked_greater(tensors, 1.0)
+    with unchecked(), pytest.raises(ValueError, match=r"tensors: got a masked array; .* use \.filled\(value\)"):
+        hj.TensorField(grid, hidden)
+
+
 def test_from_function_keeps_the_function_and_traces_its_parameters():
     grid = hj.Grid.from_bounds(-1, 1, (5, 6))
 
