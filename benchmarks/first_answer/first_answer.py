@@ -203,6 +203,7 @@ def possible(case: str, way: str) -> bool:
 def measured(case: str, way: str, folder: Path, cache: Path | None) -> dict[str, float] | None:
     """Run a process; None where the library is not installed."""
     environment = os.environ | {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # installed packages have bytecode
     if cache is not None:
         environment["JAX_COMPILATION_CACHE_DIR"] = str(cache)
     command = [sys.executable, __file__, "--child", case, way, str(folder)]

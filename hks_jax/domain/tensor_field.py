@@ -5,12 +5,11 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from hks_jax.arrays import describe_array
+from hks_jax.arrays import describe_array, jax_array
 from hks_jax.checks import real_array
 from hks_jax.compilation import numpy_where_known
 from hks_jax.domain import spd
@@ -229,8 +228,8 @@ def _evaluate(function: jtu.Partial, grid: Grid) -> Float[Array, "*shape_and_com
     # Outside the mask the function may be singular, and 0·NaN would spoil derivatives with respect to its parameters.
     # So it is evaluated at a node inside instead.
     inside = grid.inside
-    nodes = jnp.asarray(np.where(inside[..., None], grid.nodes, grid.nodes[inside][0]))
-    flat = jax.vmap(lambda x: real_array("fn", function(x)))(nodes.reshape(-1, grid.dimension)).astype(nodes.dtype)
+    nodes = jax_array(np.where(inside[..., None], grid.nodes, grid.nodes[inside][0]).reshape(-1, grid.dimension))
+    flat = jax.vmap(lambda x: real_array("fn", function(x)))(nodes).astype(nodes.dtype)
     return flat.reshape(*grid.shape, *flat.shape[1:])
 
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hks_jax.arrays import jax_array
 from hks_jax.eigen.derivative import frame_of_chosen
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.one_pencil import solve_lowest, widened
@@ -95,7 +96,7 @@ def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: i
         jnp.concatenate([pairs.residuals for pairs in solved])[lowest],
         jnp.concatenate([pairs.converged for pairs in solved])[lowest],
         kept=jnp.ones(k, bool),
-        part=jnp.asarray(np.repeat(np.arange(len(solved)), sizes))[lowest],
+        part=jax_array(np.repeat(np.arange(len(solved)), sizes))[lowest],
         next_eigenvalue=jax.lax.stop_gradient(values[order[k]]) if extra else jnp.asarray(jnp.inf, values.dtype),
         complete_below=_complete_below(pencil, solved, values[order[k + extra - 1 :][:1]], k + extra),
         spectral_origin=solved[0].spectral_origin,

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 from scipy.sparse import issparse
 from scipy.sparse.linalg import LinearOperator
 
+from hks_jax.arrays import jax_array
 from hks_jax.checks import real_array, require_number
 from hks_jax.fem.assembly import MassKind, assemble
 from hks_jax.fem.boundary import BoundarySpec
@@ -130,7 +131,7 @@ def _checked_null_vectors(pencil: SymmetricPencil, null_vectors: Any) -> Float[A
             )
     require_null_space(SymmetricPencil(pencil.stiffness, pencil.mass, null_space=NullSpace(vectors)))
     # The vectors are made orthonormal, so that they can be made M-orthonormal up to rounding.
-    return vectors if is_traced(vectors) else jnp.asarray(np.linalg.qr(np.asarray(vectors).T)[0].T)
+    return vectors if is_traced(vectors) else jax_array(np.linalg.qr(np.asarray(vectors).T)[0].T)
 
 
 def require_null_space(pencil: SymmetricPencil) -> None:

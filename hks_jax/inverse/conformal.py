@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hks_jax.arrays import jax_array
 from hks_jax.compilation import jit_quickly
 from hks_jax.domain import spd
 from hks_jax.domain.grid import Grid
@@ -61,7 +62,7 @@ def smoothing(grid: Grid, length: float, dtype: np.dtype) -> Smoothing:
     assert isinstance(pencil, Pencil)
     factor = None
     if length > 0:
-        dissection = jax.tree.map(jnp.asarray, dissect(pencil.pattern))
+        dissection = jax.tree.map(jax_array, dissect(pencil.pattern))
         factor = factorise(dissection, pencil.shifted(jnp.asarray(-1 / length**2, dtype)))
     return Smoothing(pencil, factor, jnp.asarray(length, dtype), jnp.mean(pencil.mass.diagonal()))
 

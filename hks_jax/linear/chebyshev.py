@@ -8,8 +8,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float, Int
-from scipy.special import ive
 
 from hks_jax.linear import accelerators, lapack
 from hks_jax.linear.products import aligned, matmul
@@ -104,7 +104,7 @@ def chebyshev_heat_coefficients(
 def coefficient_sizes(z: float) -> Float[np.ndarray, " n"]:
     """Return the absolute values of the coefficients of exp(−tλ), down to 1e-25."""
     n = np.arange(int(math.sqrt(2 * z * 60) + 60) + 1)
-    return np.where(n == 0, 1, 2) * ive(n, z)
+    return np.where(n == 0, 1, 2) * scipy.special.ive(n, z)
 
 
 def coefficient_tails(z: float) -> Float[np.ndarray, " n_and_1"]:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.accuracy import warn_of_accuracy
+from hks_jax.arrays import jax_array
 from hks_jax.checks import real_array
 from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.multifrontal import Factorisation, Trial, eliminate, factorise, try_out
@@ -147,7 +148,7 @@ def factorised(matrix: PatternedOperator, name: str = "matrix") -> FactorisedMat
     ones = jnp.ones(matrix.size, matrix.dtype)
     pencil = tabulated(SymmetricPencil(matrix, DiagonalOperator(ones)))
     known = jax.lax.stop_gradient(pencil)
-    dissection = jax.tree.map(jnp.asarray, dissect(matrix.pattern))
+    dissection = jax.tree.map(jax_array, dissect(matrix.pattern))
     factor, trial, tries = certain_factorisation(dissection, known, jnp.zeros((), matrix.dtype))
     if not is_traced(trial) and not trial.sound:
         raise ValueError(_failure(name, known, factor))

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.special
+import scipy
 from jax.scipy.special import erfc
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real

@@ -7,8 +7,8 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
-from scipy.special import gammaincinv
 
 from hks_jax.checks import real_array, require_number
 from hks_jax.domain.grid import Grid
@@ -142,7 +142,7 @@ class TensorNoise(eqx.Module):
             raise ValueError("first, second: got equal tensors; expected different noise. Pass a second scan")
         # The median of q is scaled to that of χ², because a few nodes, as in fluid, have much more noise than most.
         q = np.einsum("na,ab,nb->n", parts[inside], np.linalg.pinv(2 * relative), parts[inside])
-        relative *= np.median(q) / (2 * gammaincinv(len(relative) / 2, 0.5))
+        relative *= np.median(q) / (2 * scipy.special.gammaincinv(len(relative) / 2, 0.5))
         # Smoothed white noise has the correlation exp(−h²/4w²) at the distance h.
         widths = []
         for axis, h in enumerate(grid.spacing):

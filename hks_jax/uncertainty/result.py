@@ -6,8 +6,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
-from scipy.special import fdtri, stdtrit
 
 from hks_jax.checks import require_number
 
@@ -68,7 +68,7 @@ class Uncertainty(eqx.Module):
         of the number of draws. The errors must be normally distributed (see `trusted`).
         """
         require_number("level", level, 1)
-        quantile = float(stdtrit(min(self.freedom, 1e6), 0.5 + level / 2))
+        quantile = float(scipy.special.stdtrit(min(self.freedom, 1e6), 0.5 + level / 2))
         half = jax.tree.map(lambda s, b: quantile * jnp.sqrt(s**2 + b**2), self.deviation, self.bias_error)
         return jax.tree.map(jnp.subtract, self.corrected, half), jax.tree.map(jnp.add, self.corrected, half)
 
@@ -89,7 +89,7 @@ class Uncertainty(eqx.Module):
             share = jnp.abs(bias / jnp.where(deviation > 0, deviation, jnp.nan)).reshape(maps)
             second = jnp.where(deviation > 0, beyond, jnp.nan).reshape(maps)
             # The median of an estimate from few draws is below its mean. The limit is scaled by their ratio.
-            limit = BEYOND * float(fdtri(self.samples, min(self.freedom, 1e6), 0.5))
+            limit = BEYOND * float(scipy.special.fdtri(self.samples, min(self.freedom, 1e6), 0.5))
             small = (jnp.nanmedian(second, axis=1) <= limit) & (jnp.nanmedian(share, axis=1) <= 1)
             return (small & (self.indefinite <= INDEFINITE)).reshape(deviation.shape[:1])
 
