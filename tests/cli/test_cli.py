@@ -795,7 +795,8 @@ def test_fit_errors_are_one_line_and_leave_nothing(conformal, tmp_path, capsys, 
     assert sorted(tmp_path.iterdir()) == before
 
 
-@pytest.mark.parametrize("second", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
+@pytest.mark.parametrize("second", [False, True])
 def test_error_bars_begin_where_there_is_signal(npz, tmp_path, rng, second):
     noise = "0.05"
     if second:

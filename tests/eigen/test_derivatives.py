@@ -325,6 +325,7 @@ def test_filters_with_sharp_transitions_or_no_derivative_at_zero(rng, name):
     check(f, FIELDS["generic"](rng), 0.1 * symmetric(rng, SHAPE), step=1e-3)
 
 
+@pytest.mark.slow
 def test_parameters_of_the_filters(rng):
     tensors = FIELDS["rotational"](rng)
     pairs = hj.eigenpairs(hj.TensorField(GRID, tensors), 20)

@@ -314,6 +314,7 @@ def test_forms_on_a_surface_see_space(rng):
         hj.eigenpairs(hj.assemble(mesh, mass=lambda u, v, w: -u.value * v.value), 3)
 
 
+@pytest.mark.slow
 def test_what_is_true_of_the_laplacian_alone_is_left_out():
     pencil = hj.assemble(euclidean(17, 4.0), potential=square)
     pairs = hj.eigenpairs(pencil, 10)
