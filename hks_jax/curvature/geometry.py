@@ -52,7 +52,7 @@ def gaussian_curvature(field: TensorField, periodic: bool | Sequence[bool] = Fal
 
     If the field was made from a function, K is exact, from JAX derivatives. Otherwise it is from finite differences of
     sixth order of the nodal tensors, which are one-sided near the edges of the grid and the mask. K is NaN outside the
-    mask, and where no stencil of 7 nodes along a grid line fits into it (8 for a second derivative near an edge).
+    mask, and where no stencil of 7 nodes along a grid line fits into the mask (8 for a second derivative near an edge).
 
     Args:
         periodic: whether the axes are periodic (node n is node 0), one value for all or one per axis.

@@ -51,7 +51,7 @@ def differentiate(
 ) -> tuple[Float[Array, "*shape_and_components"], Bool[np.ndarray, "*shape"]]:
     """Return the first or second derivative of nodal values along a grid axis, and the nodes where it is known.
 
-    Only values at nodes inside are used. The derivative is 0 where no stencil consists of such nodes.
+    Only values at nodes inside the domain are used. The derivative is 0 where no stencil lies inside.
     """
     offsets, weights = stencils(order)
     n, d = inside.shape[axis], inside.ndim
@@ -67,7 +67,7 @@ def differentiate(
         index = (nodes + shifts[rows, column]) % n
         total += table[rows, column] * jnp.take_along_axis(values, index, axis=axis)
     valid = np.broadcast_to(valid, inside.shape)
-    # Unknown derivatives are zero and not NaN, since 0·NaN would spoil the gradient of known ones.
+    # Unknown derivatives are zero and not NaN, since 0·NaN would spoil the gradient of known derivatives.
     return jnp.where(np.expand_dims(valid, expand), total, 0), valid
 
 

@@ -32,7 +32,8 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
     zeros are merged into one point with the sum of their indices (Tricoche, Scheuermann and Hagen 2001).
 
     Points of index 0, pairs of opposite index that are closer than `merge`, and points on the rim of the domain are not
-    found. If eigenvalues are equal on a curve or in a region off the rim, its centre is returned unless its index is 0.
+    found. If eigenvalues are equal on a curve or in a region away from the rim, the centre of that set is returned
+    unless its index is 0.
 
     Args:
         field: a 2D field. Cells with a node outside the mask are not part of the domain.
@@ -61,7 +62,7 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
     tensors = nodal.astype(np.float64)
     v = np.stack([tensors[..., 0, 0] - tensors[..., 1, 1], 2 * tensors[..., 0, 1]], axis=-1)
     active = active_elements(grid.inside, (False, False))
-    # Vectors that are at most this long are zero up to rounding.
+    # A vector is zero up to rounding if its length is at most this value.
     tiny = 16 * np.finfo(nodal.dtype).eps * np.trace(tensors, axis1=-2, axis2=-1)
     winding, crossed, on_rim = _windings(v, tiny, active)
     cells = np.argwhere(active & ((winding != 0) | crossed))
@@ -72,7 +73,8 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
     graph = coo_matrix((np.ones(len(near)), near.T), shape=(len(cells),) * 2)
     count, cluster = connected_components(graph, directed=False)
     turns = winding[tuple(cells.T)]
-    # Several cells share a zero on an edge or node. The turns in each are arbitrary, but their sum is not.
+    # Several cells share a zero on an edge or node. The number of turns in each of these cells is arbitrary, but their
+    # sum is not.
     index = np.bincount(cluster, turns, count) / 2
     settled = np.bincount(cluster, on_rim[tuple(cells.T)], count) == 0
     shared = crossed[tuple(cells.T)]
@@ -89,7 +91,7 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
 def _windings(
     v: Float[np.ndarray, "nx ny 2"], tiny: Float[np.ndarray, "nx ny"], active: Bool[np.ndarray, "mx my"]
 ) -> tuple[Int[np.ndarray, "mx my"], Bool[np.ndarray, "mx my"], Bool[np.ndarray, "mx my"]]:
-    """Return the turns of v around each cell, the cells with a zero on an edge, and those with a zero on the rim."""
+    """Return the turns of v around each cell; mark the cells with a zero on an edge, and with a zero on the rim."""
     angle = np.arctan2(v[..., 1], v[..., 0])
     zero = np.hypot(v[..., 0], v[..., 1]) <= tiny
     number = np.zeros(active.shape)

@@ -22,11 +22,11 @@ class Grid(ByKey):
     A grid is static and hashable: it has no leaves, and `jax.jit`, `jax.grad` and `jax.vmap` treat it as structure.
 
     Args:
-        shape: the number of nodes along each of 2 or 3 axes, at least 2.
+        shape: the number of nodes along each of 2 or 3 axes, at least 2 per axis.
         spacing: the distance between nodes along each axis (or one number for all axes), in coordinate units.
         origin: the coordinates of node (0, …, 0).
         mask: bool array of `shape`, True inside. The domain is the union of the elements with all nodes inside; results
-            are NaN at all other nodes. None: the whole grid.
+            are NaN at nodes that belong to none of these elements. None: the whole grid.
         components: the treatment of a mask with several connected components: ``"raise"`` (default) raises an error
             with their number, ``"largest"`` keeps the one with the most nodes, ``"all"`` keeps all.
 
@@ -120,7 +120,7 @@ class Grid(ByKey):
 
     @cached_property
     def unit(self) -> "Grid":
-        """The grid of the same nodes with spacing 1 and origin 0, which determines the structure of matrices."""
+        """The grid of this shape and mask with spacing 1 and origin 0, which determines sparsity patterns."""
         unit = Grid(self.shape)
         unit._mask = self._mask
         return unit
@@ -138,11 +138,13 @@ def _checked_shape(shape: Sequence[int]) -> tuple[int, ...]:
     try:
         return tuple(operator.index(n) for n in shape)
     except TypeError:
-        raise ValueError(f"shape: got {shape!r}; expected a tuple of 2 or 3 integers, the nodes per axis") from None
+        raise ValueError(
+            f"shape: got {shape!r}; expected a tuple of 2 or 3 integers, the node counts per axis"
+        ) from None
 
 
 def per_axis(name: str, value: float | Sequence[float] | np.ndarray, dimension: int) -> tuple[float, ...]:
-    """Return a finite number for each axis, from such numbers or one number for all axes."""
+    """Return one finite number per axis; a single given number is used for all axes."""
     require_real(name, value)
     try:
         values = np.asarray(value, dtype=np.float64)

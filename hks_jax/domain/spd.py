@@ -23,7 +23,7 @@ def symmetrise(xp: Any, tensors: Any) -> Any:
 def identity_outside(
     tensors: Float[Array, "*shape d d"], inside: Bool[np.ndarray | Array, "*shape"]
 ) -> Float[Array, "*shape d d"]:
-    """Return the tensors, with the identity in their place at nodes that are not inside."""
+    """Return the tensors, replaced by the identity at nodes outside the mask."""
     return tensors if isinstance(inside, np.ndarray) and inside.all() else _identity_outside(tensors, inside)
 
 
@@ -64,7 +64,7 @@ def inverse(tensors: Any) -> Any:
 
 
 def metric_of_diffusion(tensors: Any, metric: str) -> Any:
-    """Return the metric of diffusion tensors D in JAX or NumPy: ``"inverse"``, ``"adjugate"``, or ``"tensor"``: D."""
+    """Return the metric ``"inverse"`` (D⁻¹), ``"adjugate"`` (|D| D⁻¹) or ``"tensor"`` (D) in JAX or NumPy."""
     return tensors if metric == "tensor" else inverse(tensors) if metric == "inverse" else adjugate(tensors)
 
 
@@ -96,7 +96,7 @@ def positive_or_nan(xp: Any, tensors: Any) -> Any:
     return nan_unless(xp, is_positive(tensors), tensors)
 
 
-# A product and not `where(…)`, so that derivatives are NaN too.
+# This is a product, and not `where(…)`, so that derivatives are NaN, too.
 def nan_unless(xp: Any, valid: Any, matrices: Any) -> Any:
     """Return the matrices (..., i, j) of JAX or NumPy, with NaN in place of those that are not ``valid``."""
     return matrices * xp.where(valid, 1, xp.nan).astype(matrices.dtype)[..., None, None]
@@ -104,8 +104,8 @@ def nan_unless(xp: Any, valid: Any, matrices: Any) -> Any:
 
 # If tr S = 0, the Cayley–Hamilton theorem gives S² = qI (d = 2) or S³ = pS + |S| I (d = 3). So exp S is a
 # polynomial in S of degree d − 1, whose coefficients are entire functions of q, or of p and |S|. No eigenvalues are
-# needed, and derivatives of any order are smooth where eigenvalues coincide. The coefficients are those of Taylor's
-# series at S/2ˢ, followed by s squarings of E = exp − I as 2E + E², which preserves the relative accuracy of E.
+# needed, and derivatives of any order are smooth where eigenvalues coincide. Taylor's series gives the coefficients of
+# E = exp(S/2ⁿ) − I. Each of n squarings replaces E by 2E + E², which preserves the relative accuracy of E.
 _SQUARINGS, _TERMS = 8, 20
 
 

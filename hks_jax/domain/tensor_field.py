@@ -39,9 +39,10 @@ class TensorField(eqx.Module):
         tensors: (*shape, d, d), symmetric positive definite inside the mask; ``tensors[i, j, 0, 1]`` is T₁₂ at node
             (i, j). Units: (length / coordinate unit)². Values outside the mask are ignored.
         interpolation: the interpolation between the nodes. With ``"linear"`` the components are multilinear, as in
-            Zobel, Reininghaus and Hotz; if tensors rotate from node to node, the determinant is larger in between. With
-            ``"log-euclidean"`` the components of the logarithm are multilinear (Arsigny, Fillard, Pennec and Ayache).
-            Then the logarithm of the determinant is multilinear, and T⁻¹ is interpolated in the same way as T.
+            Zobel, Reininghaus and Hotz; if tensors rotate from node to node, the determinant is larger between the
+            nodes. With ``"log-euclidean"`` the components of the logarithm are multilinear (Arsigny, Fillard, Pennec
+            and Ayache). Then the logarithm of the determinant is multilinear, and T⁻¹ is interpolated in the same way
+            as T.
 
     Raises:
         ValueError: a wrong shape; tensors that are NaN, infinite, unsymmetric or not positive definite inside the mask
@@ -70,9 +71,9 @@ class TensorField(eqx.Module):
     ) -> "TensorField":
         """Return the metric ``fn``, which maps coordinates (d,) to a tensor (d, d) and is differentiable by JAX.
 
-        The field keeps the function, so that curvature and its derivatives are exact; `assemble` evaluates it at the
-        nodes, and interpolates between them. Parameters that should be traced belong in a `jax.tree_util.Partial` or an
-        Equinox module.
+        The field keeps the function, so that curvature and its derivatives are exact; `assemble` evaluates the function
+        at the nodes and interpolates between them. Parameters that should be traced belong in a `jax.tree_util.Partial`
+        or an Equinox module.
 
         Examples:
             >>> grid = hj.Grid.from_bounds(1, 2, (9, 9))
@@ -134,7 +135,8 @@ class TensorField(eqx.Module):
         """Return the metric C = FᵀF of a deformation gradient F (*shape, d, d), the right Cauchy–Green tensor.
 
         ``F[..., i, j]`` is ∂yᵢ/∂xⱼ, where y is the position to which the point x moves, or would move without
-        constraints. Lengths are those after the deformation. Rotations after F do not change the metric.
+        constraints. Lengths are those after the deformation. A rotation after the deformation does not change the
+        metric.
 
         If F is the gradient of a map, the metric is flat, and the signature is that of the deformed body. For growth,
         plastic or elastic strain, the curvature of C is the incompatibility, or residual strain. See docs/strain.md.
@@ -226,7 +228,7 @@ def _metric_of_diffusion(xp: Any, D: Any, metric: MetricChoice) -> Any:
 
 def _evaluate(function: jtu.Partial, grid: Grid) -> Float[Array, "*shape_and_components"]:
     # Outside the mask the function may be singular, and 0·NaN would spoil derivatives with respect to its parameters.
-    # So it is evaluated at a node inside instead.
+    # So there it is evaluated at a node inside the mask instead.
     inside = grid.inside
     nodes = jax_array(np.where(inside[..., None], grid.nodes, grid.nodes[inside][0]).reshape(-1, grid.dimension))
     flat = jax.vmap(lambda x: real_array("fn", function(x)))(nodes).astype(nodes.dtype)

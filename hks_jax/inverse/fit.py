@@ -42,7 +42,7 @@ def fit_metric(
 
     The fit minimises half the weighted mean square of the differences between predicted and given signature, plus the
     penalties of the regularisers. Isometric metrics have the same signature, and high frequencies affect it little. So
-    the steps are damped, and smooth by default, and first change the directions that the data determine. The result
+    the steps are damped and, by default, smooth. They first change the directions that the data determine. The result
     states how the fit ended; a fit that stalls or is interrupted raises no error.
 
     Args:
@@ -53,13 +53,13 @@ def fit_metric(
             ascending order, including zeros.
         times: (n_times,) times, or the energies of a wave kernel signature; None if the signature has neither.
         parametrisation: ``"log-euclidean"`` or ``"cholesky"`` (the whole tensor), ``"conformal"`` (e^u T₀),
-            ``"eigenvalues"`` (with the eigenvectors of `init`), ``"rotation"`` (with its eigenvalues), a
+            ``"eigenvalues"`` (with the eigenvectors of `init`), ``"rotation"`` (with the eigenvalues of `init`), a
             `Parametrisation`, or `Free` parameters of a function.
         data: the kind of signature, the measure of differences, and the weights and noise of entries.
         regularisers: penalties from `hks_jax.inverse`: `H1`, `TotalVariation`, `LogDeterminant`, `Prior`.
-        k: the number of eigenpairs. By default a share of 1e-6 of the heat trace at the smallest time lies beyond k by
-            Weyl's law, or k is maximal. It grows if the fit reaches a field of more volume. For a wave kernel signature
-            they reach to 2σ above the largest energy.
+        k: the number of eigenpairs. By default only a share of 1e-6 of the heat trace at the smallest time lies beyond
+            k, by Weyl's law, or k is maximal, and k grows if the fit reaches a field of more volume. For a wave kernel
+            signature the default eigenvalues reach to 2σ above the largest energy.
         boundary: the same as for `eigenpairs`.
         solver: the eigensolver; ``"auto"`` chooses one for many products with the same Jacobian.
         search: the settings of the optimisation and its stopping criteria.

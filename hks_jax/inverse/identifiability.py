@@ -31,10 +31,10 @@ class Identifiability(eqx.Module):
         directions: (n, *values) their eigenvectors, normalised.
         weak_strengths: (n_weak,) upper estimates of the smallest eigenvalues in ascending order.
         weak_directions: (n_weak, *values) the directions that the data determine least.
-        resolution: (nodes,) a lower bound from the n directions on the share of each node's unknowns that the data
+        resolution: (nodes,) a lower bound, from the n directions, on the share of each node's unknowns that the data
             determine.
         deviation: (nodes,) the posterior standard deviation of each node's unknowns (root mean square) from the n
-            directions. To first order it is an upper bound on the exact one under a white prior, which means
+            directions. To first order it is an upper bound on the exact deviation under a white prior, that is, for
             independent unknowns with standard deviation τ. A prior that couples neighbours reduces it.
         effective: the number of unknowns that the data determine, Σ s²/(s² + σ²/τ²) over the n directions.
         noise: the standard deviation σ of the residuals.
@@ -72,8 +72,8 @@ def identifiability(
     """Find the directions that the data of a fit determine, from products with J and Jᵀ.
 
     The strongest directions result from randomised subspace iteration on JᵀJ (Halko, Martinsson and Tropp 2011). The
-    weakest result from subspace iteration on the complement with Chebyshev polynomials that damp strong directions.
-    Weak directions include isometries that preserve the observation, checkerboards, and changes far from observations.
+    weakest directions result from subspace iteration with Chebyshev polynomials that damp strong directions. Weak
+    directions include isometries that preserve the observation, checkerboards, and changes far from observations.
 
     Args:
         fit: the result of `fit_metric`, or its problem.

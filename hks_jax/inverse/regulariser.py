@@ -1,4 +1,4 @@
-"""Regularisers, which select a solution of a fit that the data do not determine.
+"""Regularisers, which select one of several solutions that explain the data of a fit.
 
 Each penalty is half a weighted mean of squares over the domain. Its residuals serve least squares solvers.
 """

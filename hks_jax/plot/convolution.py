@@ -19,7 +19,7 @@ PIXELS_PER_INCH = 110
 """The texture's resolution, at which single grains are visible in print and on screens."""
 
 FRAME = 3
-"""The width of the frame in pixels, which exceeds the length of a step."""
+"""The width of the border around the arrays of pixels, which exceeds the length of a step."""
 
 
 def lic_texture(
@@ -60,7 +60,7 @@ def lic_texture(
     centres = np.moveaxis(np.indices(shape), 0, -1).reshape(-1, 2) + 0.5
     points = [x0, y0] + centres * size
     noise = np.random.default_rng(seed).standard_normal(shape).astype(np.float32)
-    # For steps of one pixel the direction at every pixel suffices. Complex numbers represent vectors, and a frame of
+    # For steps of one pixel the direction at every pixel suffices. Complex numbers represent vectors, and a border of
     # NaN ends lines that leave the image. Explicit tests for this would take most of the time.
     along = _complex(direction(points) / size * side).reshape(shape)
     along, values = np.pad(along, FRAME, constant_values=np.nan), np.pad(noise, FRAME)

@@ -74,7 +74,7 @@ def hks_curves(
     lines = []
     for node, label, colour in zip(nodes, labels, colours, strict=True):
         lines += ax.plot(t, factor * curves[node], **{"color": colour, "label": label, **kwargs})
-    limits = ax.get_ylim()  # of the curves, because the series diverges at large t
+    limits = ax.get_ylim()  # without the expansion, because it diverges at large t
     if series is not None:
         for node, line in zip(nodes, lines, strict=True):
             ax.plot(t, factor * series[node], color=line.get_color(), linestyle="--", linewidth=1.0)
@@ -100,7 +100,7 @@ def _nearest_nodes(points: np.ndarray, grid: Grid) -> list[tuple[int, ...]]:
     on_grid = np.all((index >= 0) & (index < grid.shape), axis=1)
     for point, node, on in zip(points, index, on_grid, strict=True):
         if not (on and grid.inside[tuple(node)]):
-            raise ValueError(f"points: got {tuple(point.tolist())} outside the grid or its mask; choose one inside")
+            raise ValueError(f"points: got {tuple(point.tolist())} outside the grid or its mask; expected inside")
     return [tuple(node) for node in index.tolist()]
 
 

@@ -37,8 +37,8 @@ def fit_panels(
 ) -> Figure:
     """Return a figure of a fit in 2D with signatures, the metric and the loss.
 
-    A few times, including the first and the last, have a row each. It shows the target, the fitted signature in the
-    same colours, and their relative difference in colours that all rows share. Below are the unit circles of the fitted
+    Each of a few times, including the first and the last, has a row with the target, the fitted signature in the same
+    colours, and their relative difference in colours that all rows share. Below are the unit circles of the fitted
     metric and the loss over the steps, with a curve for each start.
 
     Args:

@@ -45,7 +45,7 @@ def hks_panels(
         path: the file in which to save the figure, if given.
         suptitle: the figure's title.
         orientation: the same as for `scalar_image`.
-        z: (n_times, *shape), by which values within the noise fade as in `scalar_image`.
+        z: (n_times, *shape); values within the noise fade as in `scalar_image`.
         **kwargs: arguments of `scalar_image` for all images, such as cmap, vmin, vmax, centre, quantiles, least_range
             and label.
 

@@ -19,7 +19,7 @@ from hks_jax.plot.figure import frame, require_plane, side_in_inches
 
 Which = Literal["major", "minor"]
 
-# A line ends where (λ₁ − λ₂)/(λ₁ + λ₂) falls below this, or where it would turn by more than 60° in a step.
+# A line ends where (λ₁ − λ₂)/(λ₁ + λ₂) falls below `DEGENERATE`, or where it would turn by more than 60° in a step.
 DEGENERATE = 1e-3
 LEAST_COSINE = 0.5
 
@@ -149,7 +149,7 @@ def _grow(forward: np.ndarray, backward: np.ndarray, others: cKDTree | None, gap
     """Cut a line where it is closer than `gap` to the others or to itself; join its ends if they meet."""
     if others is not None:
         forward, backward = (half[: _first(others.query(half)[0] < gap)] for half in (forward, backward))
-    # Points at this distance along the line are not mere neighbours on the line.
+    # Points that are fewer steps apart may be close just because they are neighbours on the line.
     lag = int(np.ceil(np.pi * gap / step)) + 1
     end = _first_return(forward, lag, gap)
     if end < len(forward):

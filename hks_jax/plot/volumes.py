@@ -60,12 +60,12 @@ def orthogonal_slices(
         axes: three axes, for the planes xy, xz and yz in this order.
         values: (*shape,), with NaN at nodes without a value.
         grid: the 3D grid of the values, whose spacing determines the aspect.
-        node: the indices (i, j, k) of the node, or else of the nearest node with a value; by default `middle_node` of
-            the finite values.
+        node: the indices (i, j, k) of the node. If it has no value, the nearest node with a value is used. By default
+            `middle_node` of the finite values.
         cross: whether thin lines show the positions of the other two slices.
         orientation: the orientation of the grid in space, which turns the slices and adds space coordinates and
             letters.
-        z: (*shape,), by which values within the noise fade as in `scalar_image`.
+        z: (*shape,); values within the noise fade as in `scalar_image`.
         **kwargs: arguments of `scalar_image` for the whole volume, such as cmap, vmin, vmax, centre, quantiles.
 
     Raises:
@@ -132,7 +132,7 @@ def volume_panels(
         label: the colour bars' label.
         suptitle: the figure's title.
         orientation: the same as for `orthogonal_slices`.
-        z: (n_times, *shape), by which values within the noise fade as in `hks_panels`.
+        z: (n_times, *shape); values within the noise fade as in `hks_panels`.
         **kwargs: arguments of `scalar_image` for all volumes, such as cmap, centre and quantiles.
 
     Raises:
@@ -191,12 +191,12 @@ def require_volume(grid: Grid) -> None:
 def _turned(
     array: np.ma.MaskedArray, grid: Grid, node: Sequence[int] | None, orientation: Orientation | None
 ) -> tuple[np.ma.MaskedArray, Grid, tuple[int, ...]]:
-    """Return values, grid and node, or the nearest node with a value, in the order of the image."""
+    """Return values, grid and the nearest node with a value in the order of the image."""
     if node is not None:
         nodes = np.argwhere(~np.ma.getmaskarray(array))
         node = nodes[np.argmin(np.sum((nodes - np.asarray(node)) ** 2, axis=1))].tolist()
     if orientation is not None:
         node = None if node is None else orientation.node(node, grid.shape)
         array, grid = orientation.array(array), orientation.grid(grid)
-    # The middle is determined in the image, so that ties do not depend on the storage order.
+    # The middle is determined in the order of the image, so that ties do not depend on the storage order.
     return array, grid, middle_node(~np.ma.getmaskarray(array)) if node is None else tuple(node)

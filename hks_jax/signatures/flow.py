@@ -23,8 +23,8 @@ from hks_jax.traced import is_traced
 def heat_flow(pairs: Eigenpairs, times: Any, functions: Any) -> Float[Array, "n_times *functions_and_shape"]:
     """Let functions diffuse on the domain: u(t) = Σᵢ exp(−λᵢt) φᵢ ∫φᵢu, the solution of ∂u/∂t = −Δu.
 
-    The diffusion is anisotropic where the metric is. The result is differentiable by functions, times and tensors.
-    It is NaN outside the mask, and 0 at Dirichlet nodes.
+    The diffusion is anisotropic where the metric is. The result is differentiable with respect to functions, times and
+    tensors. It is NaN outside the mask, and 0 at Dirichlet nodes.
 
     Args:
         pairs: the result of `eigenpairs`. Their boundary conditions also hold for u. Values of u at Dirichlet nodes are
@@ -40,7 +40,7 @@ def heat_flow(pairs: Eigenpairs, times: Any, functions: Any) -> Float[Array, "n_
 
     Examples:
         >>> heat = hj.heat_flow(pairs, [0.2, 0.5], field.grid.nodes[..., 0])
-        >>> [round(float((pairs.pencil.mass @ u.ravel()).sum()), 2) for u in heat]  # none is lost
+        >>> [round(float((pairs.pencil.mass @ u.ravel()).sum()), 2) for u in heat]  # no heat is lost
         [1.0, 1.0]
     """
     times, shape = times_of(pairs, times), pairs.space.node_shape
@@ -115,10 +115,11 @@ def tensor_invariants(field: TensorField) -> dict[str, Float[np.ndarray, "*shape
 def gaussian_scale_space(
     field: TensorField, times: Any, functions: Any
 ) -> Float[np.ndarray, "n_times *functions_and_shape"]:
-    """Blur functions by an isotropic Gaussian that is as wide everywhere as the mean spread of heat.
+    """Blur functions by an isotropic Gaussian of constant width, to which heat spreads on average.
 
     In coordinates the standard deviation is √(2t/s), where s is the mean of |T|^(1/d) over the domain. Division by the
-    blurred mask and reflection at the sides of the grid preserve constant functions. NaN outside the mask.
+    blurred mask and reflection at the sides of the grid preserve constant functions. The result is NaN outside the
+    mask.
 
     Args:
         field: the metric, for its scale, its grid and its mask.
@@ -148,7 +149,7 @@ def gaussian_scale_space(
 def _blur(u: np.ndarray, inside: np.ndarray, sigma: float, spacing: tuple[float, ...]) -> np.ndarray:
     weight = inside.astype(float)
     for axis, h in enumerate(spacing):
-        # Three times the side blurs any function to a constant; wider kernels only take longer.
+        # A width of three times the grid's side blurs any function to a constant; wider kernels only take longer.
         nodes = min(sigma / h, 3.0 * inside.shape[axis])
         weight = scipy.ndimage.gaussian_filter1d(weight, nodes, axis=axis, mode="mirror")
         u = scipy.ndimage.gaussian_filter1d(u, nodes, axis=axis - len(spacing), mode="mirror")

@@ -46,7 +46,7 @@ def heat_kernel(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Array, "n_
 
     Examples:
         >>> heat = hj.heat_kernel(pairs, [0.2], (4, 4))[0, 0]
-        >>> print((pairs.pencil.mass @ heat.ravel()).sum().round(3))  # all of it
+        >>> print((pairs.pencil.mass @ heat.ravel()).sum().round(3))  # the total heat
         1.0
     """
     return spectral_columns(pairs, Heat(resolved_times(pairs, times)), source_indices(pairs, sources))
@@ -55,11 +55,11 @@ def heat_kernel(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Array, "n_
 def scale_invariant_hks(
     pairs: Eigenpairs, n_frequencies: int = 6, n_times: int = 256, times: Any = None
 ) -> Float[Array, "n_frequencies *shape"]:
-    """Compute the scale-invariant HKS (Bronstein and Kokkinos 2010): |FFT| of d/dτ log HKS(exp τ, x), low frequencies.
+    """Compute the scale-invariant HKS (Bronstein and Kokkinos 2010): |FFT(d/dτ log HKS(exp τ, x))| at low frequencies.
 
-    Scaling the metric by β shifts τ by log β² and lowers log HKS by a constant. The derivative removes the constant and
-    the modulus of the Fourier transform the shift. The default times scale with the spectrum, so invariance is exact.
-    The moduli are dimensionless, and NaN outside the mask and at Dirichlet nodes.
+    Scaling the metric by β shifts τ by log β² and lowers log HKS by a constant. The derivative removes the constant,
+    and the modulus of the Fourier transform removes the shift. The default times scale with the spectrum, so invariance
+    is exact. The moduli are dimensionless, and NaN outside the mask and at Dirichlet nodes.
 
     Args:
         n_frequencies: the number of Fourier moduli, from frequency 0.
@@ -161,7 +161,7 @@ def spectral_signature(
     parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), parameters)
     shapes = [leaf.shape for leaf in jax.tree.leaves(parameters)]
     if not shapes or len({shape[:1] for shape in shapes}) != 1 or not all(shapes):
-        raise ValueError(f"parameters: got arrays of shapes {shapes}; expected equal first axes: one entry per f")
+        raise ValueError(f"parameters: got arrays of shapes {shapes}; expected equal first axes, one entry per filter")
     filters = Custom(function, parameters)
     if sources is None:
         return spectral_diagonal(pairs, filters)

@@ -65,7 +65,7 @@ def spectral_flow(
 
     Under "mirror" and "mean" the functions are extended evenly, like the metric.
     """
-    # Inner products over the doubled domain are twice those over the domain for each doubling, or 0 for odd functions.
+    # Each doubling of the domain multiplies inner products of even functions by two; those with odd functions are 0.
     everywhere = pairs.on(on_all_nodes(pairs.pencil))
     parts, known = everywhere.pencil.parts, pairs.space.restrict(functions)
     functionals = len(parts) * parts[0].integrals(pairs.space.transfer(known, everywhere.space))
@@ -81,7 +81,7 @@ def spectral_trace(pairs: Eigenpairs, filters: Filter) -> Float[Array, " m"]:
 @jax.custom_jvp
 def _kernel(contraction: Contraction, filters: Filter, pairs: Eigenpairs) -> Array:
     """Return the contraction of the kernels Φ f(Λ) Φᵀ of m filters."""
-    # In a second derivative JAX differentiates this body instead of the rule, which is not supported.
+    # For second derivatives JAX differentiates this body instead of the rule. Second derivatives are not supported.
     pairs = first_order_only(pairs)
     return _weighted(contraction, _all_weights(filters, pairs.eigenvalues, pairs.kept), pairs.at_nodes)
 
@@ -139,7 +139,7 @@ def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 
 def _rows_of(pairs: Eigenpairs, number: int) -> tuple[Int[Array, " m"], Bool[Array, " m"]] | None:
-    """Return rows that include the pairs of one part of a doubled domain, and which rows are such pairs.
+    """Return indices of rows that include all pairs of one part of a doubled domain, and whether each row is such.
 
     The number of rows is rounded up to one of few sizes. The result is None if there are no parts.
     """
@@ -171,7 +171,7 @@ def _tangent(
     change: Pencil,
     reader: Pencil | None,
 ) -> Array:
-    """Return the derivative by the change of one part, given the pairs and the derivative of their frame."""
+    """Return the derivative for the change of one part, given its pairs and the derivative of their frame."""
     values, vectors, kept, d_frame = (x if selection is None else x[selection[0]] for x in (*pairs, d_frame))
     if selection is not None:
         vectors = jnp.where(selection[1][:, None], vectors, 0)  # pairs of other parts do not mix with these

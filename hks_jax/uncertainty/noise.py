@@ -157,9 +157,9 @@ class TensorNoise(eqx.Module):
         """Estimate the level of noise from second differences of the tensors.
 
         In a smooth field, the tensor at a node minus the mean of its two neighbours along an axis is noise, with √1.5
-        times the standard deviation of the noise of one node. A median over all nodes and axes is robust against few
-        edges. The noise must be independent between nodes. The estimate is too small after smoothing or
-        interpolation, and too large in fine anatomy.
+        times the standard deviation of the noise of one node. A median over all nodes and axes is robust against a few
+        edges. The noise must be independent between nodes. The estimate is too small after smoothing or interpolation,
+        and too large in fine anatomy.
 
         Args:
             tensors: (*shape, d, d), the measured tensors.

@@ -41,7 +41,7 @@ _LOUD = 3.0
 
 
 class _Moments(eqx.Module):
-    """The sum of the squared linear parts over balanced samples, and the mean and squared deviations of even parts."""
+    """Over balanced samples, the sum of squared linear parts, and the mean and squared deviations of even parts."""
 
     n: Array
     odd: Any
@@ -62,8 +62,9 @@ class _Moments(eqx.Module):
 # Let η₁, η₂, η₃ be independent noise with the covariance Σ. The four sums δ = (±η₁ ± η₂ ± η₃)/√3 are the corners of a
 # tetrahedron; each δ has the covariance Σ. Let y be the four maps at D + sδ. The δ add up to zero, so the mean of y
 # minus the value is of second order, and its expectation is s² times the bias. Up to second order, we have
-# y₁ + y₂ − y₃ − y₄ = 4sJη₁/√3; similar formulas give Jη₂ and Jη₃. Four maps thus give three samples, and two antithetic
-# pairs give two. The second-order variance is that of a quadratic form of one δ; the mean of four has a third of it.
+# y₁ + y₂ − y₃ − y₄ = 4sJη₁/√3; similar formulas give Jη₂ and Jη₃. Four maps thus give three samples, whereas two
+# antithetic pairs of maps give only two. The second-order variance is that of a quadratic form of one δ; the mean of
+# four has a third of it.
 @jax.jit
 def _parts(maps: list[Any], value: Any) -> tuple[Any, Any]:
     """Return the samples Jη (3, …) of the noise of the value, and the even part, whose expectation is the bias."""
@@ -134,7 +135,8 @@ def uncertainty(
             belongs to another computation.
 
     Warns:
-        AccuracyWarning: No intervals are claimed, because noise makes tensors indefinite or acts beyond linear.
+        AccuracyWarning: if no intervals are claimed, because noise makes tensors indefinite or its effect is not
+            linear.
 
     Examples:
         >>> noise = hj.TensorNoise.relative(field.tensors, 0.1)
@@ -155,7 +157,7 @@ def uncertainty(
         value = run(measured)
     except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
         raise ValueError(
-            "function: got one that JAX cannot trace, because it depends on concrete values; expected a traceable one. "
+            "function: got a function of concrete values, which JAX cannot trace; expected a traceable function. "
             'Pass compiled=False, or avoid choices by values such as hks(…, method="auto")'
         ) from error
     if method == "auto":
@@ -253,7 +255,7 @@ def _white(noise: TensorNoise, seed: Any, index: Any, dtype: Any) -> Array:
 
 @jax.jit
 def _four(measured: Array, noise: TensorNoise, seed: Any, index: Any) -> tuple[list[Array], Array]:
-    """Return four noisy tensor fields with noise of sum zero, and the sum of the indefinite shares with full noise."""
+    """Return four tensor fields with halved noise of sum zero, and the sum of the indefinite shares for full noise."""
     each = jnp.stack([noise.tensors(_white(noise, seed, 3 * index + i, measured.dtype)) for i in range(3)])
     changes = jnp.tensordot(
         jnp.asarray(_SIGNS / math.sqrt(3), each.dtype), each, 1, precision=jax.lax.Precision.HIGHEST

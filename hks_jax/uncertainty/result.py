@@ -107,7 +107,7 @@ class Uncertainty(eqx.Module):
         """Return `signal_to_noise` over the given nodes, for example nodes with little influence of the boundary.
 
         Args:
-            nodes: bool array that broadcasts to the shape of the value. The ratio is NaN if it contains no node.
+            nodes: bool array that broadcasts to the shape of the value. The ratio is NaN if no node is true.
         """
 
         def of(value: Array, deviation: Array) -> Array:
