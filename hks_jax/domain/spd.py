@@ -27,11 +27,9 @@ def identity_outside(
     return tensors if isinstance(inside, np.ndarray) and inside.all() else _identity_outside(tensors, inside)
 
 
-@jax.jit
-def _identity_outside(
-    tensors: Float[Array, "*shape d d"], inside: Bool[np.ndarray | Array, "*shape"]
-) -> Float[Array, "*shape d d"]:
-    return jnp.where(inside[..., None, None], tensors, jnp.eye(tensors.shape[-1], dtype=tensors.dtype))
+@numpy_where_known()
+def _identity_outside(xp: Any, tensors: Any, inside: Any) -> Any:
+    return xp.where(inside[..., None, None], tensors, xp.eye(tensors.shape[-1], dtype=tensors.dtype))
 
 
 def adjugate(tensors: Any) -> Any:
@@ -69,11 +67,13 @@ def metric_of_diffusion(tensors: Any, metric: str) -> Any:
 
 
 def cholesky(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
-    """Return the lower triangular L with T = LLᵀ; NaN for matrices that are not positive definite."""
-    d, factor = tensors.shape[-1], jnp.zeros_like(tensors)
-    for j in range(d):
+    """Return the lower triangular L with T = LLᵀ for positive semidefinite T. A column with the pivot zero is zero."""
+    factor = jnp.zeros_like(tensors)
+    for j in range(tensors.shape[-1]):
         column = tensors[..., j] - jnp.sum(factor * factor[..., j, None, :], axis=-1)
-        factor = factor.at[..., j:, j].set(column[..., j:] / jnp.sqrt(column[..., j, None]))
+        zero = (column[..., j] <= 1e-12 * tensors[..., j, j])[..., None]
+        column = column / jnp.sqrt(jnp.where(zero, 1, column[..., j, None]))
+        factor = factor.at[..., j:, j].set(jnp.where(zero, 0, column)[..., j:])
     return factor
 
 

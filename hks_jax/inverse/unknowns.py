@@ -2,7 +2,6 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -17,7 +16,6 @@ from hks_jax.checks import require_real
 from hks_jax.domain import spd
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.linear.dense_eigh import differentiable_eigh
 
 Values = Float[Array, "..."]
 Tensors = Float[Array, "n d d"]
@@ -88,7 +86,7 @@ def _scaled(parameters: Parameters, base: Tensors) -> Tensors:
 
 
 def _stretched(parameters: Parameters, base: Tensors) -> Tensors:
-    values, vectors = jax.vmap(partial(differentiable_eigh, None))(base)
+    values, vectors = spd.eigh(base)
     return jnp.einsum("nia,na,nja->nij", vectors, jnp.exp(parameters) * values, vectors, precision="highest")
 
 

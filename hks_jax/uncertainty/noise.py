@@ -11,6 +11,7 @@ import scipy
 from jaxtyping import Array, Float
 
 from hks_jax.checks import real_array, require_number
+from hks_jax.domain import spd
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_checks import tensors_on
 from hks_jax.traced import is_traced
@@ -203,7 +204,7 @@ class TensorNoise(eqx.Module):
             kernels = [jnp.asarray(each, white.dtype) for each in gaussians(self.grid, self.correlation)]
             white = along_axes(kernels, white)
         if self.modes is None:
-            root = _root(jnp.asarray(self.covariance)).astype(white.dtype)
+            root = spd.cholesky(jnp.asarray(self.covariance)).astype(white.dtype)
             parts = jnp.einsum("...ab,...b->...a", root, white, precision="highest")
         else:
             parts = jnp.einsum("...na,n->...a", self.modes.astype(white.dtype), white, precision="highest")
@@ -214,18 +215,6 @@ class TensorNoise(eqx.Module):
 
 def _squared_mean(tensors: Any) -> Float[Array, "*shape 1 1"]:
     return jnp.square(jnp.trace(jnp.asarray(tensors), axis1=-2, axis2=-1) / np.shape(tensors)[-1])[..., None, None]
-
-
-def _root(covariance: Float[Array, "*shape m m"]) -> Float[Array, "*shape m m"]:
-    """Return the Cholesky factor. If a pivot is zero, as for a singular covariance, its column is zero."""
-    factor = jnp.zeros_like(covariance)
-    least = 1e-12 * jnp.max(jnp.diagonal(covariance, axis1=-2, axis2=-1), axis=-1)
-    for j in range(covariance.shape[-1]):
-        column = covariance[..., j] - jnp.sum(factor * factor[..., j, None, :], axis=-1)
-        positive = (column[..., j] > least)[..., None]
-        column = column / jnp.sqrt(jnp.where(positive, column[..., j, None], 1))
-        factor = factor.at[..., j:, j].set(jnp.where(positive, column, 0)[..., j:])
-    return factor
 
 
 def _check_semidefinite(covariance: Float[np.ndarray, "*shape m m"]) -> None:
