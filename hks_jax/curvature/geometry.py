@@ -114,8 +114,8 @@ def riemann(metric: Jet) -> Float[Array, "... p p"]:
 def einstein(metric: Jet) -> Float[Array, "... 3 3"]:
     """Return the Einstein tensor (Ric − ½Rg)ⁱʲ of a three-dimensional metric.
 
-    It is the double dual of the curvature tensor, and so determines it in three dimensions: component ij is
-    −R_abcd/|g|, where the planes ab and cd are perpendicular to the axes i and j.
+    The Einstein tensor is the double dual of the curvature tensor, which it determines in three dimensions: component
+    ij is −R_abcd/|g|, where the planes ab and cd are perpendicular to the axes i and j.
     """
     return -riemann(metric) / spd.determinant(metric.value)[..., None, None]
 

@@ -74,7 +74,7 @@ def differentiate(
 def _choose(
     inside: np.ndarray, offsets: np.ndarray, axis: int, wraps: bool
 ) -> tuple[np.ndarray, Bool[np.ndarray, "*shape"]]:
-    """Return for each node the first stencil with all nodes inside (0 if there is none), and whether there is one."""
+    """Return for each node the first stencil with all nodes inside (0 if none fits), and whether a stencil fits."""
     reach = MINIMUM_NODES - 1
     width = [(reach, reach) if a == axis else (0, 0) for a in range(inside.ndim)]
     padded = np.pad(inside, width, mode="wrap") if wraps else np.pad(inside, width)
@@ -178,7 +178,7 @@ def domain_nodes(grid: Grid, wraps: tuple[bool, ...]) -> Bool[np.ndarray, "*shap
 def at_nodes(fn: Callable[[Array], Any], grid: Grid, inside: Bool[np.ndarray, "*shape"]) -> Any:
     """Evaluate a function of position at every node; arrays in the result have the shape (*shape, …) of the grid.
 
-    Nodes outside the domain get the value at a node inside. The function may be undefined outside, and a NaN there
+    Nodes outside the domain get the value at a node inside. The function may be undefined outside the domain, and NaN
     would spoil gradients even if it is masked afterwards.
     """
     flat = np.where(inside[..., None], grid.nodes, grid.nodes[inside][0]).reshape(-1, grid.dimension)

@@ -13,7 +13,7 @@ from hks_jax.checks import require_real
 
 
 def as_mask(name: str, values: Any) -> Bool[np.ndarray, "*shape"]:
-    """Return zeros and ones as booleans; raise ValueError for anything else."""
+    """Return a mask of zeros and ones as booleans; raise ValueError for other values."""
     array = np.asarray(values)
     require_real(name, array)
     if array.dtype != bool and not np.isin(array, (0, 1)).all():

@@ -37,14 +37,14 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
 
     Args:
         field: a 2D field. Cells with a node outside the mask are not part of the domain.
-        merge: zeros in cells that are at most `merge` cells apart along either axis count as one point. It is at least
-            1, because a zero on an edge belongs to two cells.
+        merge: zeros in cells that are at most `merge` cells apart along either axis count as one point. The least value
+            is 1, because a zero on an edge belongs to two cells.
 
     Returns:
         The points, sorted by the first and then by the second coordinate.
 
     Raises:
-        ValueError: a 3D field; merge less than 1.
+        ValueError: if the field is 3D, or if `merge` is less than 1.
 
     Examples:
         >>> hj.degenerate_points(hj.examples.degenerate_point_field(0.5, 9))
@@ -125,7 +125,7 @@ def _ends(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _zeros_in_cells(v: Float[np.ndarray, "nx ny 2"], cells: Int[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """Return the zero of the bilinear interpolant in each cell, in units of its sides; the centre if there is none.
+    """Return the zero of the bilinear interpolant in each cell, in units of the cell's sides, or else its centre.
 
     Eliminating x from both components of a₀ + a₁x + a₂y + a₃xy = 0 gives a quadratic equation in y.
     """

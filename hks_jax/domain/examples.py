@@ -62,7 +62,7 @@ def bumpy_torus(x: Float[Array, " 2"]) -> Float[Array, " 3"]:
 def torus_field(shape: Sequence[int], major: float = 2.0, minor: float = 1.0) -> TensorField:
     """Return the metric of a torus of revolution on its periodic chart (0, 2π)²; both axes are ``"periodic"``.
 
-    Its Gaussian curvature is cos x₂ / (minor (major + minor cos x₂)).
+    The Gaussian curvature is cos x₂ / (minor (major + minor cos x₂)).
 
     Examples:
         >>> print(hj.examples.torus_field((9, 9)).tensors[0, 0].diagonal().round(3))  # of the outer equator
@@ -117,8 +117,8 @@ def ball_mesh(n: int) -> TetMesh:
     vertices. Dihedral angles are between 36° and 130°.
 
     Let jₗ be the spherical Bessel functions. With Dirichlet conditions the eigenvalues of the ball are the squares of
-    the positive zeros of jₗ; with Neumann conditions they are 0 and the squares of the positive zeros of jₗ'. Each has
-    the multiplicity 2l + 1.
+    the positive zeros of jₗ; with Neumann conditions they are 0 and the squares of the positive zeros of jₗ'. Each
+    eigenvalue has the multiplicity 2l + 1.
 
     Examples:
         >>> mesh = hj.examples.ball_mesh(2)
@@ -212,8 +212,8 @@ def figure4_fields(n: int, major: float = 4.0, minor: float = 1.0) -> dict[str, 
     """Return fields of constant eigenvalues and analytic eigenvectors on n × n nodes of (0, 1)² (paper, Fig. 4).
 
     All fields have the same constant trace, determinant and anisotropy; only the eigenvectors differ. The centre of
-    ``"circles"`` and ``"spirals"`` is (−0.3, −0.3), outside the square. These two fields and ``"straight"`` are flat,
-    the others are not.
+    ``"circles"`` and ``"spirals"`` is (−0.3, −0.3), outside the square. The fields ``"straight"``, ``"circles"`` and
+    ``"spirals"`` are flat; ``"waves"`` and ``"cells"`` are not.
 
     Examples:
         >>> waves = hj.examples.figure4_fields(9)["waves"]
@@ -241,8 +241,8 @@ def degenerate_point_field(index: float, n: int) -> TensorField:
     The eigenvalues are 10 ± 3|u|, and the major eigenvector has the angle ``index``·θ, where ``index`` is a multiple of
     ½ and θ is the polar angle: T = 10·I + 3|u| [[c, s], [s, −c]] with c = cos(2·index·θ) and s = sin(2·index·θ). If z =
     u₁ ± iu₂ with the sign of the index, and m = |2·index|, then c + is = (z/|z|)ᵐ, so no angle is computed. For the
-    indices ±½ the field is smooth at the centre. For other indices it has no derivative there, and its curvature is
-    NaN.
+    indices ±½ the field is smooth at the centre. For other indices the field has no derivative at the centre, where the
+    curvature is NaN.
 
     Examples:
         >>> hj.degenerate_points(hj.examples.degenerate_point_field(-0.5, 9)).indices
@@ -279,8 +279,8 @@ def phantom(
 ) -> tuple[Float[np.ndarray, "*shape d d"], Bool[np.ndarray, "*shape"], tuple[float, ...]]:
     """Return diffusion tensors of a phantom that resembles an axial slice of a brain, or a stack of such slices.
 
-    It has a folded cortex of grey matter, and two ventricles. Its white matter has a corpus callosum, an arc of fibres
-    on each side, and crossings of callosum and arcs.
+    The phantom has a folded cortex of grey matter, and two ventricles. Its white matter has a corpus callosum, an arc
+    of fibres on each side, and crossings of callosum and arcs.
 
     Args:
         shape: the number of voxels along 2 axes (left–right, back–front) or 3 axes (left–right, back–front, down–up).

@@ -100,7 +100,7 @@ class Grid(ByKey):
 
     @property
     def inside(self) -> np.ndarray:
-        """The mask as bool (*shape), True everywhere if there is none."""
+        """The mask as bool (*shape); True everywhere if the grid has no mask."""
         return np.ones(self.shape, dtype=bool) if self._mask is None else self._mask.value
 
     @property
@@ -149,11 +149,11 @@ def per_axis(name: str, value: float | Sequence[float] | np.ndarray, dimension: 
     try:
         values = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"{name}: got {value!r}; expected {dimension} numbers, one per axis of shape") from None
+        raise ValueError(f"{name}: got {value!r}; expected {dimension} numbers, one per axis") from None
     if values.ndim == 0:
         values = np.full(dimension, values)
     if values.shape != (dimension,) or not np.isfinite(values).all():
-        raise ValueError(f"{name}: got {value}; expected {dimension} finite numbers, one per axis of shape")
+        raise ValueError(f"{name}: got {value}; expected {dimension} finite numbers, one per axis")
     return tuple(values.tolist())
 
 
@@ -175,7 +175,7 @@ def _checked_mask(mask: Any, shape: tuple[int, ...], components: str) -> np.ndar
         if components == "raise":
             largest = ", ".join(str(n) for n in np.sort(sizes)[::-1][:5]) + (", …" if count > 5 else "")
             raise ValueError(
-                f"mask: got {count} connected components ({largest} nodes); expected one. "
+                f"mask: got {count} connected components ({largest} nodes); expected one component. "
                 'Pass components="largest" to keep the largest one, or components="all" to keep all'
             )
         array = labels == 1 + int(np.argmax(sizes))

@@ -82,7 +82,7 @@ def checked_mask(
         )
     if not kept.any():
         places = "vertices" if len(inside) == n_vertices else words.argument
-        raise ValueError(f"mask: {int(inside.sum())} of {inside.size} {places} are inside, but no {words.simplex}")
+        raise ValueError(f"mask: {int(inside.sum())} of {inside.size} {places} are inside, but no {words.simplex} is")
     return kept
 
 
@@ -126,7 +126,7 @@ def check_places(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulatio
             edge = triangulation.facet_vertices(crowded[:1])[0].tolist()
             warn_of_accuracy(
                 f"faces: {crowded.size} edges belong to three triangles or more (the first has the vertices {edge}): "
-                "the surface branches there, and heat flows into all branches. To avoid that, remove inner sheets"
+                "the surface branches there, and heat flows into all branches. To avoid this, remove the inner sheets"
             )
         _warn_of_hanging(vertices, triangulation)
         return

@@ -71,15 +71,15 @@ class SimplicialMesh(eqx.Module):
         g = |D| D⁻¹. On a surface D stands for its tangential part. If D is the identity, g is the metric of space.
 
         If the tensors are given at vertices, each cell takes the mean of the tensors at its vertices, or with
-        ``"log-euclidean"`` the exponential of the mean of their logarithms. This is the interpolant at the centre of
-        the cell. Its error is of second order, like that of the elements. The metric is differentiable with respect to
-        tensors and vertices.
+        ``"log-euclidean"`` the exponential of the mean of their logarithms. The mean is the interpolant at the centre
+        of the cell. The error of this approximation is of second order, like the error of the elements. The metric is
+        differentiable with respect to tensors and vertices.
 
         Args:
             vertices: positions (V, 3).
             cells: vertex indices of the triangles (F, 3) or tetrahedra (C, 4).
-            tensors: one symmetric tensor per cell, (F, 3, 3) or (C, 3, 3), or per vertex, (V, 3, 3). They must be
-                positive definite; on a surface, only their tangential parts must be.
+            tensors: one symmetric tensor per cell, (F, 3, 3) or (C, 3, 3), or per vertex, (V, 3, 3). The tensors must
+                be positive definite; on a surface, only their tangential parts must be.
             metric: ``"inverse"``, ``"tensor"`` or ``"adjugate"``.
             at: whether the tensors belong to ``"faces"`` (of a surface), ``"cells"`` (of a solid) or ``"vertices"``;
                 needed only if there are as many cells as vertices.
@@ -121,7 +121,7 @@ class SimplicialMesh(eqx.Module):
 class SurfaceMesh(SimplicialMesh):
     """A triangle mesh in space, with the metric that space induces on it, or with a given metric.
 
-    It is a pytree: its leaves are the vertex positions and the given metric, if any. The connectivity is static.
+    A mesh is a pytree: its leaves are the vertex positions and the given metric, if any. The connectivity is static.
 
     Args:
         vertices: positions (V, 3).
@@ -156,7 +156,7 @@ class SurfaceMesh(SimplicialMesh):
 class TetMesh(SimplicialMesh):
     """A mesh of tetrahedra, with the metric of space, or with a given metric that is constant on each tetrahedron.
 
-    It is a pytree: its leaves are the vertex positions and the given metric, if any. The connectivity is static.
+    A mesh is a pytree: its leaves are the vertex positions and the given metric, if any. The connectivity is static.
 
     Tetrahedra must be positively oriented, (v₁ − v₀) × (v₂ − v₀) · (v₃ − v₀) > 0, as in VTK and Gmsh. So an inverted
     tetrahedron is an error, for example after moving a vertex. Under `jit` it gives NaN instead.
@@ -236,7 +236,7 @@ def _tangential_metric(
     parts = matmul(across[:, None], symmetric[corners], frames[:, None])
     # The tensors at all vertices of a cell, and not only their mean, must be positive definite.
     parts = spd.nan_unless(xp, spd.is_positive(parts), parts)
-    # The logarithm is that of the tangential part, because the tensor in space may be indefinite.
+    # The logarithm of the tangential part is used, because the tensor in space may be indefinite.
     mean = xp.mean(parts, axis=1) if interpolation == "linear" else spd.exp(jnp.mean(spd.log(parts), axis=1))
     coordinates = matmul(across, edges)
     return matmul(xp.swapaxes(coordinates, -1, -2), spd.metric_of_diffusion(mean, metric), coordinates)

@@ -92,13 +92,13 @@ def is_positive(t: Any) -> Any:
 
 @numpy_where_known()
 def positive_or_nan(xp: Any, tensors: Any) -> Any:
-    """Return the matrices, d = 2 or 3, with NaN in place of those that are not positive definite."""
+    """Return the matrices, d = 2 or 3, with NaN in place of matrices that are not positive definite."""
     return nan_unless(xp, is_positive(tensors), tensors)
 
 
-# This is a product, and not `where(…)`, so that derivatives are NaN, too.
+# A product with NaN, unlike `where(…)`, makes the derivatives NaN, too.
 def nan_unless(xp: Any, valid: Any, matrices: Any) -> Any:
-    """Return the matrices (..., i, j) of JAX or NumPy, with NaN in place of those that are not ``valid``."""
+    """Return the matrices (..., i, j) of JAX or NumPy, with NaN in place of matrices that are not ``valid``."""
     return matrices * xp.where(valid, 1, xp.nan).astype(matrices.dtype)[..., None, None]
 
 
@@ -186,8 +186,8 @@ def _log_by_eigenvalues(tensors: Float[Array, "... d d"]) -> Float[Array, "... d
     return _log_of_pairs(values, vectors)
 
 
-# The derivative of f(T) is V ([f]∘(Vᵀ dT V)) Vᵀ with the divided differences [f] of f (Daleckii and Krein 1965). They
-# are smooth where eigenvalues coincide, whereas the derivatives of eigenvectors are not.
+# The derivative of f(T) is V ([f]∘(Vᵀ dT V)) Vᵀ with the divided differences [f] of f (Daleckii and Krein 1965). The
+# divided differences are smooth where eigenvalues coincide, whereas the derivatives of eigenvectors are not.
 @_log_by_eigenvalues.defjvp
 def _log_by_eigenvalues_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     values, vectors = eigh(primals[0])

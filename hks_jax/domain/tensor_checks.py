@@ -132,8 +132,8 @@ def right_cauchy_green(name: str, grid: Grid, F: Any) -> Float[Array, "*shape d 
             first = tuple(int(i) for i in np.argwhere(bad)[0])
             raise ValueError(
                 f"{name}: {int(bad.sum())} of {int(grid.inside.sum())} gradients have a determinant that is not "
-                f"positive (the first at node {first}, {determinants[first]:.3g}); expected deformations that preserve "
-                f"orientation. Check that {name}[..., i, j] is ∂yᵢ/∂xⱼ, or exclude these nodes by the mask"
+                f"positive (the first is {determinants[first]:.3g} at node {first}); expected deformations that "
+                f"preserve orientation. Check that {name}[..., i, j] is ∂yᵢ/∂xⱼ, or exclude these nodes by the mask"
             )
     inside = grid.inside[..., None, None]
     safe = jnp.where(inside, gradients, jnp.eye(m, d, dtype=gradients.dtype))

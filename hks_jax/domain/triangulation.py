@@ -23,8 +23,8 @@ oriented simplex are oriented outward."""
 class Triangulation(ByKey):
     """The connectivity of a mesh of triangles or tetrahedra, static and hashable.
 
-    Facets are the edges of triangles, or the triangles of tetrahedra. They are numbered cell by cell: facet
-    (d + 1) c + i is opposite corner i of cell c. A facet between two cells has two numbers.
+    Facets are the edges of triangles, or the triangles of tetrahedra. Facets are numbered cell by cell: facet (d + 1) c
+    + i is opposite corner i of cell c. A facet between two cells has two numbers.
     """
 
     def __init__(self, cells: Int[np.ndarray, "n corners"], n_vertices: int) -> None:
@@ -79,7 +79,7 @@ class Triangulation(ByKey):
 
     @cached_property
     def crowded_facets(self) -> Int[np.ndarray, " m"]:
-        """One number of each facet that belongs to three or more cells."""
+        """The facets that belong to three or more cells, each by one of its numbers."""
         order, begins, _ = self._grouped_facets
         starts = np.flatnonzero(begins)
         return order[starts[np.diff(np.append(starts, order.size)) > 2]]

@@ -36,7 +36,8 @@ class InnerProduct(eqx.Module):
 class Smoothing(InnerProduct):
     """The inner product ⟨x, y⟩ + ℓ²⟨∇x, ∇y⟩ of each component, where ℓ is the length below which steps are smooth.
 
-    It contains the mass matrix, because a node at the boundary has only half a cell and affects the data less.
+    The inner product contains the mass matrix, because a node at the boundary has only half a cell and affects the data
+    less.
     """
 
     pencil: Pencil  # stiffness and lumped mass of the flat metric
@@ -83,7 +84,7 @@ _POWER, _REACH = 3, 9.0
 class ConformalInformation(eqx.Module):
     """B½ (1 + L/λ₁)⁻³ B½ for JᵀJ, with the lumped mass B and a Laplacian L of the initial metric by differences.
 
-    Its inverse is a polynomial of L, which takes three products with L. The eigenvalues of JᵀJ + μB are at least about
+    The inverse is a polynomial of L, which takes three products with L. The eigenvalues of JᵀJ + μB are at least about
     μ. λ₁ is so large that the same holds for the preconditioner.
     """
 
@@ -111,7 +112,7 @@ def conformal_information(unknowns: Nodal, mass: InnerProduct, times: Float[Arra
     grid, nodes = unknowns.init.grid, unknowns.nodes.value
     relative = mass.apply(unknowns.start() + 1)
     at_nodes = jnp.zeros(grid.size, relative.dtype).at[nodes].set(relative[:, 0]).reshape(grid.shape)
-    # Values outside the domain are arbitrary, because no edge leads there.
+    # The metric outside the domain is arbitrary, because no edge leads there.
     metric = jnp.where(grid.inside[..., None, None], unknowns.init.domain_tensors, jnp.eye(grid.dimension))
     inverse = spd.inverse(metric)
     weights, rows = [], jnp.zeros_like(at_nodes)

@@ -42,7 +42,7 @@ def fit_metric(
 
     The fit minimises half the weighted mean square of the differences between predicted and given signature, plus the
     penalties of the regularisers. Isometric metrics have the same signature, and high frequencies affect it little. So
-    the steps are damped and, by default, smooth. They first change the directions that the data determine. The result
+    the steps are damped and, by default, smooth. Steps first change the directions that the data determine. The result
     states how the fit ended; a fit that stalls or is interrupted raises no error.
 
     Args:
@@ -121,7 +121,7 @@ def fit_metric(
         warn_of_accuracy(
             f"noise: the fit {result} with residuals of {(2 * misfit) ** 0.5:.2g}, above the noise {noise:.2g}. "
             "The fitted metric does not explain the target, and its differences from init may be artefacts. Use "
-            'another parametrisation, such as "log-euclidean", another init, weaker regularisers, or a larger noise='
+            'another parametrisation, such as "log-euclidean", another init, weaker regularisers, or a larger noise'
         )
     field, history, losses = unknowns.field(values), tuple(now.history), tuple(now.losses)
     return MetricFit(field, float(outcome.loss), misfit, left, history, result, values, problem, losses, noise)

@@ -39,7 +39,7 @@ class _State(eqx.Module):
     gradient: Values  # the gradient at these unknowns
     promised: Float[Array, ""]  # the linearised change of half the sum of squares by the last step
     change: Float[Array, ""]  # the size of the last accepted step, relative to the tolerance
-    damped: Float[Array, ""]  # xᵀBx of this step x over its curvature; times μ, it is the share of damping
+    damped: Float[Array, ""]  # xᵀBx over the curvature of this step x; μ times this ratio is the share of damping
     tight: Bool[Array, ""]  # whether the linear systems are solved more exactly
     done: Bool[Array, ""]  # whether the descent has converged
 
@@ -58,9 +58,9 @@ def _empty(structure: Any) -> Any:
 class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _State]):
     """The default solver of `hks_jax.fit_metric`.
 
-    Its steps δ solve (JᵀJ + μB) δ = −Jᵀr, where B is an inner product of the unknowns and μ = damping / step size. The
-    conjugate gradients stop early, because far from the solution the linearisation error exceeds the algebraic error.
-    They return a descent direction whenever they stop.
+    The steps δ of the solver satisfy (JᵀJ + μB) δ = −Jᵀr, where B is an inner product of the unknowns and μ = damping /
+    step size. The conjugate gradients stop early, because far from the solution the linearisation error exceeds the
+    algebraic error. Whenever the iteration stops, it returns a descent direction.
 
     The settings are arrays, so a compiled step works for all their values.
 
@@ -113,7 +113,7 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _State]):
         self.preconditioner = preconditioner or self.inner_product
 
     def accepted(self, y: Values, state: _State) -> _State:
-        """Return the state after the step from y to the trial; the next step computes the gradient there."""
+        """Return the state after the step from y to the trial; the next step computes the gradient at the trial."""
         step = state.trial - y
         change = optx.rms_norm(step / (self.rtol * (1 + jnp.abs(state.trial))))
         moved, curvature = change > 0, -jnp.vdot(step, state.gradient)
@@ -177,8 +177,8 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _State]):
     ) -> tuple[Values, _State, Any]:
         """Accept or reject the trial, and choose the next; return the unknowns and the auxiliary output.
 
-        Choosing the next trial is most of the work. It is skipped if the option ``"enough"``, a function, is true of
-        the auxiliary output.
+        Choosing the next trial is most of the work. This work is skipped if the function in the option ``"enough"`` is
+        true of the auxiliary output.
         """
         linearised, aux = _linearise(fn, state.trial, args)
         # Traces are compared by identity, so the trace of the state is used in all states.

@@ -133,7 +133,7 @@ class MetricFit:
 
         Args:
             prior: the standard deviation of every unknown without data, in the parametrisation's units.
-            noise: the standard deviation of the residuals, by default that of the fit.
+            noise: the standard deviation of the residuals, by default `MetricFit.noise`.
             draws: the number of draws; the relative error of a deviation is 1/√(2·draws).
             seed: the seed of the draws.
 

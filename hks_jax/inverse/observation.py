@@ -98,7 +98,7 @@ class Observation(eqx.Module):
         return self.shape[0] if self.signature.lowest else self.signature.pairs_needed(k, times, pencil, field)
 
     def residuals(self, pairs: Eigenpairs) -> Float[Array, " m"]:
-        """Return the residuals. The misfit is half their sum of squares."""
+        """Return the residuals, whose half sum of squares is the misfit."""
         return self.compare(self.predict(pairs))
 
     def compare(self, predicted: Array) -> Float[Array, " m"]:
@@ -108,8 +108,8 @@ class Observation(eqx.Module):
     def truncation_misfit(self, pairs: Eigenpairs) -> Float[Array, ""]:
         """Estimate the misfit between the metric's signatures from k and from all eigenpairs.
 
-        It is half the weighted sum of squares of the missing pairs' contributions to the residuals, and zero for
-        signatures that the k pairs define.
+        The estimate is half the weighted sum of squares of the missing pairs' contributions to the residuals, and zero
+        for signatures that the k pairs define.
         """
         if self.signature.left_out is None:
             return jnp.zeros(())

@@ -58,7 +58,7 @@ class Problem(eqx.Module):
         return eigenpairs(field, self.k, self.boundary, self.solver, multiplet="complete")
 
     def evaluate(self, values: Values) -> tuple[Float[Array, " m"], Float[Array, " r"], Outcome]:
-        """Return the residuals of the data, those of the penalties, and the outcome."""
+        """Return the residuals of the data, the residuals of the penalties, and the outcome."""
         field = self.unknowns.field(values)
         pairs = self._pairs_of(field)
         data = _residuals_of(self.observation, pairs, self.solver)
@@ -72,7 +72,7 @@ class Problem(eqx.Module):
         return data, penalty, jax.lax.stop_gradient(outcome)
 
     def residuals(self, values: Values) -> tuple[Float[Array, " m"], Float[Array, " r"]]:
-        """Return the residuals of the data and those of the penalties."""
+        """Return the residuals of the data and of the penalties."""
         return self.evaluate(values)[:2]
 
 

@@ -33,10 +33,10 @@ class Search:
         smoothness: the length, in coordinate units, below which Gauss–Newton steps are smooth, or 0 for steps without
             smoothing. The default is a tenth of the domain, and 0 for ``"conformal"`` without noise.
         tolerance: a fit has converged when the unknowns u change by less than this, relative to 1 + |u| (root mean
-            square). Both the last step and the sum of future steps must satisfy this; they are predicted by a geometric
-            series. Linear systems of steps that may be the last are solved 30 times more exactly with three times as
-            many products. Directions that the products do not reach are ignored; `identifiability` finds them. Solvers
-            of optimistix test only the last step.
+            square). Both the last step and the sum of future steps must satisfy this criterion; a geometric series
+            predicts future steps. Linear systems of steps that may be the last are solved 30 times more exactly with
+            three times as many products. Directions that the products do not reach are ignored; `identifiability` finds
+            them. Solvers of optimistix test only the last step.
         max_steps: the maximum number of steps in each stage.
         continuation: the number of stages. The first fits only the largest times, the last fits all times.
         starts: the number of starts, first from the initial field and then from random smooth changes of it. The best
@@ -93,7 +93,7 @@ _EARLY = 100.0
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """One search that starts from the unknowns `first`."""
+    """One search for unknowns, which starts from the unknowns `first`."""
 
     search: Search  # the settings
     first: Values  # the unknowns of the initial field

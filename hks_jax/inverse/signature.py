@@ -34,7 +34,7 @@ class Signature(eqx.Module):
         at_nodes: whether the signature has a value at each node.
         left_out: a function of eigenpairs and times that estimates the share of the signature beyond the eigenpairs, or
             None if the computed pairs define the signature.
-        lowest: whether the signature consists of the lowest eigenvalues, whose number is that of the target.
+        lowest: whether the signature consists of the lowest eigenvalues; their number is the size of the target.
         sigma: the width of wave kernels.
     """
 

@@ -53,7 +53,8 @@ def flat_signature(
 ) -> Float[np.ndarray, "*shape"]:
     """Return 4πt·HKS, which is 1 where a metric is flat and its boundary is far.
 
-    It uses the whole spectrum on small grids, and the eigenpairs up to exp(−λₖt) ≈ exp(−exponent) on large grids.
+    The function uses the whole spectrum on small grids, and the eigenpairs up to exp(−λₖt) ≈ exp(−exponent) on large
+    grids.
     """
     if math.prod(field.grid.shape) > SMALL:
         return signature(field, [time], enough_pairs(field, time, boundary, exponent), boundary, "flat")[0]

@@ -46,7 +46,7 @@ def hks_curves(
         points: (n, d) coordinates, one row for each curve.
         expansion: (n_times, *shape) the result of `hks_jax.hks_expansion`.
         limit: the least time that the eigenpairs resolve, `hks_jax.truncation(pairs, times).smallest_time`. Times below
-            it are shaded.
+            the limit are shaded.
         labels: a label for each point, by default its coordinates.
         unit: the unit of t.
         scaled: whether to draw (4πt)^(d/2)·HKS, which is 1 for flat space without boundary, on a linear scale.
@@ -100,7 +100,7 @@ def _nearest_nodes(points: np.ndarray, grid: Grid) -> list[tuple[int, ...]]:
     on_grid = np.all((index >= 0) & (index < grid.shape), axis=1)
     for point, node, on in zip(points, index, on_grid, strict=True):
         if not (on and grid.inside[tuple(node)]):
-            raise ValueError(f"points: got {tuple(point.tolist())} outside the grid or its mask; expected inside")
+            raise ValueError(f"points: got {tuple(point.tolist())} outside the grid or its mask; choose one inside")
     return [tuple(node) for node in index.tolist()]
 
 
@@ -118,10 +118,11 @@ def spectrum(
     Args:
         ax: the axes to draw on.
         pairs: the result of `eigenpairs`; pairs that are not kept are omitted.
-        domain: the field or mesh of the pairs, for the second term of the law, which belongs to the boundary. Without
-            it only the first term is drawn.
+        domain: the field or mesh of the pairs, for the second term of the law, which belongs to the boundary. Without a
+            domain only the first term is drawn.
         remainder: whether to draw N(λ) minus the law. This difference has no trend, but it falls if eigenvalues are
-            missing or if the grid is too coarse for the last ones, because finite-element eigenvalues are too large.
+            missing or if the grid is too coarse for the last eigenvalues, because finite-element eigenvalues are too
+            large.
         unit: the unit of λ.
         **kwargs: arguments of `Axes.plot` for N.
 

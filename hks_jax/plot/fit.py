@@ -44,7 +44,7 @@ def fit_panels(
     Args:
         fit: the result of `hks_jax.fit_metric`.
         target: (n_times, *grid.shape) the target of the fit; NaN at unobserved entries.
-        times: (n_times,) times or energies, by default those of the fit.
+        times: (n_times,) times or energies, by default the fit's.
         max_times: the maximum number of rows with times.
         title: the figure's title.
         orientation: the orientation of the grid in space, as for `scalar_image`.

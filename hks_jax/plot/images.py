@@ -54,7 +54,7 @@ def scalar_image(
         quantiles: the quantiles of the values that get the first and the last colour, unless vmin and vmax are given.
             The colour bar has arrows if values lie beyond.
         least_range: the least difference between the values of the first and the last colour, relative to the larger
-            value. It prevents colours from showing rounding or discretisation errors of a constant.
+            value. A larger range prevents colours from showing rounding or discretisation errors of a constant.
         colorbar: whether to add a colour bar.
         label: the colour bar's label.
         orientation: the orientation of the grid in space, which turns the image and adds space coordinates and letters.
@@ -186,7 +186,7 @@ def panel_colours(
     shared: bool = False,
     **kwargs: Any,
 ) -> list[dict[str, Any]]:
-    """Return the arguments of `scalar_image` for each image, given those for all images.
+    """Return the arguments of `scalar_image` for each image, given the arguments for all images.
 
     The values of the first and the last colour of each image are its `limits`. Without limits they follow from the
     values of the image, or of all images together if `shared` is set.
@@ -194,7 +194,7 @@ def panel_colours(
     rules = {name: kwargs.pop(name) for name in RULES if name in kwargs}
     if limits is not None:
         if len(limits) != len(images):
-            raise ValueError(f"limits: got {len(limits)}; expected {len(images)}, one pair per time")
+            raise ValueError(f"limits: got {len(limits)} pairs; expected {len(images)}, one pair per time")
         return [{**kwargs, "vmin": low, "vmax": high} for low, high in limits]
     values = [image.compressed() for image in images]
     colours = colours_of([np.concatenate(values)], **rules) * len(values) if shared else colours_of(values, **rules)

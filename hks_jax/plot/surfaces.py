@@ -146,7 +146,7 @@ def isosurfaces(
     ((low, high, _),) = colours_of([array.compressed()], quantiles, vmin=vmin, vmax=vmax)
     heights = np.linspace(low, high, levels + 2)[1:-1] if isinstance(levels, int) else np.asarray(levels, np.float64)
     if heights.ndim != 1 or not heights.size or not np.isfinite(heights).all():
-        raise ValueError(f"levels: got {levels}; expected a number of at least 1, or finite values")
+        raise ValueError(f"levels: got {levels}; expected a positive number of levels, or finite values")
     if not 0 < opacity <= 1:
         raise ValueError(f"opacity: got {opacity}; expected a number in (0, 1]")
     if not np.isfinite(view).all() or np.hypot(view[0], view[1]) == 0:

@@ -37,7 +37,8 @@ class DirectionField:
         grid = field.grid
         tensors = np.asarray(field.domain_tensors, dtype=np.float64)
         self.which = which
-        # (a, b) is λ₁ − λ₂ times (cos 2θ, sin 2θ) for the major angle θ. Division by the trace makes it dimensionless.
+        # (a, b) is λ₁ − λ₂ times (cos 2θ, sin 2θ) for the major angle θ. Division by the trace makes (a, b)
+        # dimensionless.
         difference = tensors[..., 0, 0] - tensors[..., 1, 1]
         components = np.stack([difference, 2 * tensors[..., 0, 1], np.trace(tensors, axis1=-2, axis2=-1)], -1)
         components[~grid.inside] = np.nan
@@ -102,7 +103,7 @@ def evenly_spaced_lines(
 ) -> list[Float[np.ndarray, "m 2"]]:
     """Return integral lines that fill the domain with a distance of about `separation`, in coordinates.
 
-    The method is that of Jobard and Lefer, “Creating evenly-spaced streamlines of arbitrary density” (1997). The next
+    The method is due to Jobard and Lefer, “Creating evenly-spaced streamlines of arbitrary density” (1997). The next
     line starts as close as allowed to the existing lines. A line ends where it is closer than half the separation to
     another line or to itself. Circles are closed.
 

@@ -78,7 +78,7 @@ def orthogonal_slices(
         (0.0, 4.0)
     """
     if len(axes) != 3:
-        raise ValueError(f"axes: got {len(axes)}; expected 3, for the planes xy, xz and yz")
+        raise ValueError(f"axes: got {len(axes)} axes; expected 3, for the planes xy, xz and yz")
     require_volume(grid)
     noise = None if z is None else masked("z", z, grid)
     if noise is not None and orientation is not None:
@@ -136,7 +136,7 @@ def volume_panels(
         **kwargs: arguments of `scalar_image` for all volumes, such as cmap, centre and quantiles.
 
     Raises:
-        ValueError: if shapes disagree or there is no time, or as in `orthogonal_slices`.
+        ValueError: if shapes disagree, if no time is given, or as in `orthogonal_slices`.
 
     Examples:
         >>> grid = hj.Grid((5, 5, 5))

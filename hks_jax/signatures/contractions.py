@@ -23,7 +23,7 @@ _ON_HOST = 1 << 22
 
 
 class Contraction(eqx.Module):
-    """A linear functional of the kernel Φ C Φᵀ with a matrix C (k, k). It is linear in its array leaves, too."""
+    """A function of the kernel Φ C Φᵀ with a matrix C (k, k), linear in the kernel and in its own array leaves."""
 
     @abstractmethod
     def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m *s n"]:

@@ -184,8 +184,9 @@ def _broadcast(values: Any, space: FunctionSpace) -> Any:
     return values.reshape(*values.shape, *[1] * len(space.node_shape))
 
 
-# By the Cauchy–Schwarz inequality the errors of the normalised kernel are about as large as those of its diagonal.
-# These errors are the truncated share of the trace, and the mean of the residuals weighted by the terms of the trace.
+# By the Cauchy–Schwarz inequality the errors of the normalised kernel are about as large as the errors of its diagonal.
+# The errors of the diagonal are the truncated share of the trace, and the mean of the residuals weighted by the terms
+# of the trace.
 #
 # Linear elements have the eigenvalue ξ² (1 + ξ²h²/12) and the mass 1 − ξ²h²/6 at the frequency ξ along an axis. In the
 # kernel ∫ exp(iξd − tλ)/m dξ the means of powers of ξ are ⟨ξ²⟩ = (2t − d²)/4t² and ⟨ξ⁴⟩ = (d⁴ − 12td² + 12t²)/16t⁴. To
@@ -204,8 +205,8 @@ def _least_kernels(
     residuals = jnp.sum(weights * jnp.where(pairs.kept, pairs.residuals, 0)[None], axis=1) / jnp.sum(weights, axis=1)
     error = MARGIN * truncation(pairs, times).tail + residuals + 100 * jnp.finfo(times.dtype).eps
     at_nodes = jnp.where(space.free, jnp.square(resolution.mesh_width), 0)
-    # The spacing along the geodesic is not known. It is replaced by the spacing at its ends or, if larger, the mean
-    # spacing.
+    # The spacing along the geodesic is not known. The spacing at the ends of the geodesic or, if larger, the mean
+    # spacing replaces it.
     along = jnp.maximum(
         jnp.maximum(at_nodes[None], _broadcast(at_nodes.ravel()[nodes], space)), jnp.sum(at_nodes) / space.n_dof
     )

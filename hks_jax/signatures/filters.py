@@ -14,7 +14,7 @@ from hks_jax.linear.divided_differences import divided_difference, gauss
 
 
 class Filter(eqx.Module):
-    """An elementwise function f(λ) of the eigenvalue. Its parameters are differentiable array leaves.
+    """An elementwise function f(λ) of the eigenvalue, whose parameters are differentiable array leaves.
 
     Several filters are stored as one filter whose leaves have a leading axis, for `jax.vmap`.
     """

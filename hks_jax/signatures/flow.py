@@ -24,7 +24,7 @@ def heat_flow(pairs: Eigenpairs, times: Any, functions: Any) -> Float[Array, "n_
     """Let functions diffuse on the domain: u(t) = Σᵢ exp(−λᵢt) φᵢ ∫φᵢu, the solution of ∂u/∂t = −Δu.
 
     The diffusion is anisotropic where the metric is. The result is differentiable with respect to functions, times and
-    tensors. It is NaN outside the mask, and 0 at Dirichlet nodes.
+    tensors. The result is NaN outside the mask, and 0 at Dirichlet nodes.
 
     Args:
         pairs: the result of `eigenpairs`. Their boundary conditions also hold for u. Values of u at Dirichlet nodes are
@@ -83,7 +83,7 @@ def tensor_invariants(field: TensorField) -> dict[str, Float[np.ndarray, "*shape
     """Return the ``"trace"``, ``"determinant"`` and ``"anisotropy"`` of the tensors at the nodes; NaN outside the mask.
 
     The anisotropy is (λ₁ − λ₂)/(λ₁ + λ₂) in 2D and the fractional anisotropy (Basser and Pierpaoli 1996) in 3D. Both
-    are below 1, and 0 for multiples of the identity.
+    kinds of anisotropy are below 1, and 0 for multiples of the identity.
 
     Args:
         field: the tensors on a grid. Pass ``TensorField(Grid(shape), T)`` for an array T (*shape, d, d). For diffusion

@@ -153,8 +153,8 @@ def hks_auto(
     known_pairs, known_times = jax.lax.stop_gradient((pairs, times))
     if is_traced((known_pairs.eigenvalues, known_times)):
         raise ValueError(
-            'method: got "auto" with traced values (jax.jit, vmap), by which it cannot choose; expected "spectral" '
-            'or, for small times, "spectrum-free"'
+            'method: got "auto" with traced values (jax.jit, vmap), but the choice depends on values; expected '
+            '"spectral" or, for small times, "spectrum-free"'
         )
     estimate = truncation(known_pairs, known_times)
     spectral = np.asarray(estimate.tail) <= tolerance

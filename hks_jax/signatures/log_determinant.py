@@ -32,9 +32,10 @@ class LogDeterminant(NamedTuple):
 
     Attributes:
         value: log det′ Δ.
-        error: an estimate of the discretisation error and of omitted terms of the heat trace, without derivatives.
+        error: an estimate of the discretisation error and of omitted terms of the heat trace; derivatives treat it as a
+            constant.
         time: the time T up to which the heat trace is computed from its coefficients, and after which from eigenvalues;
-            without derivatives.
+            derivatives treat it as a constant.
     """
 
     value: Float[Array, ""]
@@ -51,7 +52,8 @@ def heat_coefficients(
 ) -> Float[Array, " 3"]:
     """Return a₀, a₁, a₂ of the heat trace Σ exp(−λᵢt) ~ a₀/t + a₁/√t + a₂ of a surface (Kac 1966; McKean, Singer 1967).
 
-    They are a₀ = V/4π, a₁ = ±L/8√π (+ for Neumann conditions) and a₂ = χ/6 + Σ (π − θ)²/24πθ over the corners.
+    The coefficients are a₀ = V/4π, a₁ = ±L/8√π (+ for Neumann conditions) and a₂ = χ/6 + Σ (π − θ)²/24πθ over the
+    corners.
 
     Args:
         pairs: the result of `eigenpairs` in 2D. V is the area; under "mirror" and "mean" it is the area of the doubled
@@ -127,7 +129,7 @@ def log_determinant(
     d, dtype = dimension_of(require_pairs(pairs), "the determinant"), pairs.eigenvalues.dtype
     a = jnp.asarray(coefficients, dtype)
     if a.ndim != 1 or a.size <= d:
-        raise ValueError(f"coefficients: got shape {a.shape}; expected at least {d + 1}, a₀ to a_{d}")
+        raise ValueError(f"coefficients: got shape {a.shape}; expected at least {d + 1} coefficients, a₀ to a_{d}")
     powers = np.asarray(extrapolate, float)
     if not (powers > 0).all() or len(set(powers)) != powers.size:
         raise ValueError(f"extrapolate: got {extrapolate}; expected distinct positive powers of t")
@@ -146,7 +148,7 @@ def log_determinant(
     weights = np.linalg.solve(2.0 ** np.outer(np.append(0, powers), np.arange(count)), np.eye(count)[0])
     levels = [values[:, i : i + 2 * count : 2] @ jnp.asarray(weights, dtype) for i in range(3)]
     rest = jnp.maximum(jnp.abs(levels[0] - levels[1]), jnp.abs(levels[0] - levels[2]))
-    # The error of the trace of linear elements is d h²/16t, three times that of the signature at a node.
+    # The error of the trace of linear elements is d h²/16t, three times the error of the signature at a node.
     bias = 3 * truncation(pairs, times).resolution_bias * jnp.abs(a[0]) * times ** (-d / 2) / (d / 2 + 1)
     errors = jax.lax.stop_gradient(rest + jnp.where(jnp.isfinite(bias), bias, 0))
     best = jnp.argmin(jnp.where(jnp.isfinite(errors), errors, jnp.inf))

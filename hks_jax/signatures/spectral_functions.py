@@ -65,7 +65,7 @@ def spectral_flow(
 
     Under "mirror" and "mean" the functions are extended evenly, like the metric.
     """
-    # Each doubling of the domain multiplies inner products of even functions by two; those with odd functions are 0.
+    # Each doubling of the domain multiplies inner products of even functions by two; products with odd functions are 0.
     everywhere = pairs.on(on_all_nodes(pairs.pencil))
     parts, known = everywhere.pencil.parts, pairs.space.restrict(functions)
     functionals = len(parts) * parts[0].integrals(pairs.space.transfer(known, everywhere.space))
@@ -96,9 +96,9 @@ def _weighted(contraction: Contraction, weights: Float[Array, "m k"], vectors: F
 #
 #     F = [f]∘G − [λf]∘H,    [f]ᵢⱼ = (f(λᵢ) − f(λⱼ))/(λᵢ − λⱼ),  [f]ᵢᵢ = f'(λᵢ),    [λf]ᵢⱼ = f(λᵢ) + λⱼ [f]ᵢⱼ.
 #
-# This does not depend on the basis chosen within a multiple eigenvalue, and is not singular there. Truncation sets f to
-# zero on all pairs that are not kept. Then F is unchanged among the kept pairs, and between a kept i and all other j
-# the entries f(λᵢ) (Gᵢⱼ − λᵢHᵢⱼ)/(λᵢ − λⱼ) add up to
+# F does not depend on the basis chosen for a multiple eigenvalue, and is not singular there. Truncation sets f to zero
+# on all pairs that are not kept. Then F is unchanged among the kept pairs, and between a kept i and all other j the
+# entries f(λᵢ) (Gᵢⱼ − λᵢHᵢⱼ)/(λᵢ − λⱼ) add up to
 #
 #     Σᵢ f(λᵢ) (φᵢxᵢᵀ + xᵢφᵢᵀ),    xᵢ = (I − ΦΦᵀM) dφᵢ,
 #
@@ -139,9 +139,9 @@ def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 
 def _rows_of(pairs: Eigenpairs, number: int) -> tuple[Int[Array, " m"], Bool[Array, " m"]] | None:
-    """Return indices of rows that include all pairs of one part of a doubled domain, and whether each row is such.
+    """Return rows that include all pairs of one part of a doubled domain, and whether each row belongs to the part.
 
-    The number of rows is rounded up to one of few sizes. The result is None if there are no parts.
+    The number of rows is rounded up to one of few sizes. The result is None if the domain is not doubled.
     """
     if pairs.part is None:
         return None
@@ -177,7 +177,7 @@ def _tangent(
         vectors = jnp.where(selection[1][:, None], vectors, 0)  # pairs of other parts do not mix with these
     if not len(vectors):
         return jnp.zeros_like(contraction.weighted(_all_weights(filters, values, kept), vectors))
-    d_frame = jnp.where(kept[:, None], d_frame, 0)  # it may be NaN where pairs are not kept
+    d_frame = jnp.where(kept[:, None], d_frame, 0)  # d_frame may be NaN where pairs are not kept
     size = even_size(len(vectors), _ROWS)
     starts, place = row_blocks(len(vectors), size)
 

@@ -157,7 +157,7 @@ def suitable(metric: Any, spacing: Any, inside: Bool[np.ndarray, "*shape"], boun
 def suitable_times(
     dimension: int, volume: float, width2: float, size: float, nodes: int, problems: int = 1
 ) -> dict[str, float]:
-    """Return the least times that the spacing and the default k resolve, the k for the former, and a largest time.
+    """Return the least time that the spacing resolves, its k, the least time for the default k, and a largest time.
 
     `width2` is the squared distance between neighbouring nodes, and `size` is the domain's length. Under "mean" and
     "mirror" several problems share the eigenpairs.

@@ -33,8 +33,8 @@ class Truncation(eqx.Module):
 
     Attributes:
         times: (n,).
-        tail: (n,) the share of the heat trace beyond the k pairs, by Weyl's law. It is a mean over the domain; single
-            nodes lack more (`truncation_map`).
+        tail: (n,) the share of the heat trace beyond the k pairs, by Weyl's law. This share is a mean over the domain;
+            single nodes lack more (`truncation_map`).
         resolution_bias: (n,) the relative discretisation error at the median node.
         lasting_bias: (n,) the part of this error that does not decrease with t, due to tensors that turn or stretch.
         coarse_fraction: (n,) the fraction of nodes where the discretisation error exceeds 10 %.
@@ -97,7 +97,7 @@ def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]
     """Estimate the truncation error of k pairs and the discretisation error of the signature at each time.
 
     Weyl's law N(λ) = k (λ/Λ)^(d/2), where Λ is the first eigenvalue beyond the k, gives the part of the heat trace
-    beyond Λ. This is a mean over the domain; `truncation_map` estimates the error at each node.
+    beyond Λ. This part is a mean over the domain; `truncation_map` estimates the error at each node.
 
     The discretisation error has two parts of leading order in the spacing h. The first part is d h²/48t for a constant
     metric whose axes are those of the grid, and larger otherwise. The second part does not decrease with t: where
@@ -139,7 +139,7 @@ def _truncation(
     by_weyl: bool,
     order: int,
 ) -> tuple[Any, ...]:
-    """Return the fields of `Truncation` except the times, by Weyl's exponent d/2 or by that of the spectrum."""
+    """Return the fields of `Truncation` except the times, by Weyl's exponent d/2 or the spectrum's exponent."""
     # Weyl's law counts from the bottom of the spectrum, which a potential shifts.
     values, next_eigenvalue = values - bottom, next_eigenvalue - bottom
     complete = xp.isinf(next_eigenvalue)
@@ -167,16 +167,16 @@ def _truncation(
     return tail, median_of_shares(xp, bias, free), median_of_shares(xp, lasting, free), coarse, smallest
 
 
-# If all eigenvalues are larger by the factor 1 + δ, the heat trace Z(t) is that of the time (1 + δ)t. This error is
-# proportional to s = −(2/d) d log Z/d log t, which is 1 at small t (Weyl) and 0 where only the constant is left. If the
-# volume is larger by the factor 1 + v, the metric is multiplied by (1 + v)^(2/d). This divides the signature by 1 + v
-# and the eigenvalues by (1 + v)^(2/d), which is an error of v(1 − s). The truncated part of the trace has s = 1.
+# If all eigenvalues are larger by the factor 1 + δ, the heat trace at t becomes Z((1 + δ)t). This error is proportional
+# to s = −(2/d) d log Z/d log t, which is 1 at small t (Weyl) and 0 where only the constant is left. If the volume is
+# larger by the factor 1 + v, the metric is multiplied by (1 + v)^(2/d). This divides the signature by 1 + v and the
+# eigenvalues by (1 + v)^(2/d), which is an error of v(1 − s). The truncated part of the trace has s = 1.
 def _resolution_bias(
     xp: Any, errors: tuple[Any, Any, Any], free: Any, times: Any, slope: Any, order: int
 ) -> tuple[Any, Any]:
     """Return the estimated relative discretisation error (n, nodes) and its part that does not decrease with t.
 
-    Both are 0 at nodes that are not free.
+    Both numbers are 0 at nodes that are not free.
     """
     dispersion, turning = (xp.where(free, x, 0).ravel() for x in errors[:2])
     lasting = slope[:, None] * turning[None] + (xp.abs(1 - slope) * errors[2])[:, None]
@@ -207,7 +207,7 @@ def _estimated(pairs: Eigenpairs, times: Any) -> tuple[Eigenpairs, Float[Array, 
     """Return pairs and times as constants to derivatives; raise ValueError if the pairs allow no estimate."""
     at = times_of(pairs, times)
     if not pairs.lowest:
-        raise ValueError("pairs: got eigenpairs in an interval; truncation can be estimated only for the lowest")
+        raise ValueError("pairs: got eigenpairs in an interval; truncation can be estimated only for the lowest pairs")
     return jax.lax.stop_gradient((pairs, at))
 
 

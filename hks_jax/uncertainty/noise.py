@@ -39,8 +39,8 @@ class TensorNoise(eqx.Module):
         freedom: the degrees of freedom of the covariance if it was estimated; infinite if it was given.
 
     Raises:
-        ValueError: The covariance is not positive semidefinite, or has another shape; the correlation is positive and
-            there is no grid.
+        ValueError: The covariance is not positive semidefinite, or has another shape; the correlation is positive, but
+            the noise has no grid.
 
     Examples:
         >>> noise = hj.TensorNoise(np.tile(np.eye(3), (9, 9, 1, 1)))
@@ -64,7 +64,7 @@ class TensorNoise(eqx.Module):
                 "and 6 for tensors in 3D (xx xy yy xz yz zz)"
             )
         if grid is not None and shape[:-2] != grid.shape:
-            raise ValueError(f"covariance: got shape {shape}; expected {(*grid.shape, *shape[-2:])}, as the grid")
+            raise ValueError(f"covariance: got shape {shape}; expected {(*grid.shape, *shape[-2:])} for this grid")
         if self.correlation and grid is None:
             raise ValueError("correlation: got a length but no grid; expected both. Pass the grid of the tensors")
         if not is_traced(self.covariance):
@@ -141,7 +141,8 @@ class TensorNoise(eqx.Module):
         relative = np.einsum("na,nb->ab", parts[inside], parts[inside]) / (2 * inside.sum())
         if not np.trace(relative) > 0:
             raise ValueError("first, second: got equal tensors; expected different noise. Pass a second scan")
-        # The median of q is scaled to that of χ², because a few nodes, as in fluid, have much more noise than most.
+        # The median of q is scaled to the median of χ², because a few nodes, as in fluid, have much more noise than
+        # most.
         q = np.einsum("na,ab,nb->n", parts[inside], np.linalg.pinv(2 * relative), parts[inside])
         relative *= np.median(q) / (2 * scipy.special.gammaincinv(len(relative) / 2, 0.5))
         # Smoothed white noise has the correlation exp(−h²/4w²) at the distance h.

@@ -63,8 +63,8 @@ class _Moments(eqx.Module):
 # tetrahedron; each δ has the covariance Σ. Let y be the four maps at D + sδ. The δ add up to zero, so the mean of y
 # minus the value is of second order, and its expectation is s² times the bias. Up to second order, we have
 # y₁ + y₂ − y₃ − y₄ = 4sJη₁/√3; similar formulas give Jη₂ and Jη₃. Four maps thus give three samples, whereas two
-# antithetic pairs of maps give only two. The second-order variance is that of a quadratic form of one δ; the mean of
-# four has a third of it.
+# antithetic pairs of maps give only two. The second-order variance belongs to a quadratic form of one δ; the mean over
+# four δ has a third of it.
 @jax.jit
 def _parts(maps: list[Any], value: Any) -> tuple[Any, Any]:
     """Return the samples Jη (3, …) of the noise of the value, and the even part, whose expectation is the bias."""
@@ -107,15 +107,15 @@ def uncertainty(
     measured tensors already contain noise. The relative error of a deviation is 29 % with 8 draws, and 8 % with 100.
 
     Args:
-        function: maps tensors (*shape, d, d) to an array, or to a pytree of arrays. JAX must be able to trace it,
-            unless `compiled` is false. Times and energies should be fixed, and not depend on the eigenpairs.
+        function: maps tensors (*shape, d, d) to an array, or to a pytree of arrays. JAX must be able to trace the
+            function, unless `compiled` is false. Times and energies should be fixed, and not depend on the eigenpairs.
         tensors: (*shape, d, d), the measured tensors at nodes or cells; positive definite at nodes with noise.
         noise: the noise of the tensors (see `TensorNoise`).
         method: ``"resample"`` computes maps of noisy tensors. ``"exact"`` computes the variance gᵀΣg of each number of
-            the result by one reverse-mode product. ``"linear"`` computes `draws` products with one linearisation. The
-            last two also compute eight maps, for the bias and the second-order variance. ``"auto"`` chooses
-            ``"exact"`` if the result has at most `draws` numbers, or else ``"resample"``, because a product with the
-            Jacobian of a signature takes as long as one or two signatures.
+            the result by one reverse-mode product. ``"linear"`` computes `draws` products with one linearisation. Both
+            ``"exact"`` and ``"linear"`` also compute eight maps, for the bias and the second-order variance. ``"auto"``
+            chooses ``"exact"`` if the result has at most `draws` numbers, or else ``"resample"``, because a product
+            with the Jacobian of a signature takes as long as one or two signatures.
         draws: the number of noisy maps (products for ``"linear"``), at least 8; rounded up to a multiple of four.
         smoothing: the standard deviation, in coordinate units, of a Gaussian that smooths the tensors before the
             function is evaluated (see `smooth_tensors`); the noise must have a grid. 0 for no smoothing.
@@ -124,7 +124,8 @@ def uncertainty(
         progress: a function that is called with a short text after every four maps.
         checkpoint: a file that is written after every four maps. If it exists, resampling continues from its state.
         each: a function that is called with each sample of the noise of the value, three times for four maps, for
-            example to compute covariances or errors of means. It is not called for the samples of a checkpoint.
+            example to compute covariances or errors of means. The function is not called for the samples of a
+            checkpoint.
 
     Returns:
         The value with its standard deviation, its bias and their accuracy. Under `jit`, `method` must not be
@@ -224,13 +225,13 @@ def _check(measured: Array, noise: TensorNoise, method: str, draws: int, smoothi
     level = float(np.median(np.sqrt(variance[noisy]) / mean[noisy]))
     if not 1e-6 < level < _LOUD:
         raise ValueError(
-            f"noise: got a standard deviation of {level:.3g} of the mean diffusivity (median over the nodes); expected "
-            f"1e-6 to {_LOUD:g}. Give the covariance in the squared unit of the tensors, and diffusivities, not metrics"
+            f"noise: got a standard deviation of {level:.3g} times the mean diffusivity (median over the nodes); "
+            f"expected 1e-6 to {_LOUD:g}. Pass diffusivities, not metrics, and a covariance in their squared unit"
         )
 
 
 def _positive(measured: Array, noisy: Array) -> tuple[Array, Array]:
-    """Raise small eigenvalues of indefinite noisy tensors; return all tensors, and the share of indefinite ones.
+    """Raise small eigenvalues of indefinite noisy tensors; return all tensors, and the share that was indefinite.
 
     Nodes whose tensor is not positive definite without noise, as outside a mask, are ignored.
     """

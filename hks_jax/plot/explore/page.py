@@ -66,7 +66,7 @@ def explore(
         labels: (*shape) integers that define regions, 0 for none.
         label_names: the names of the labels.
         title: the page's title.
-        unit: the unit of t, by default that of the result.
+        unit: the unit of t, by default the result's.
 
     Returns:
         The path.
@@ -108,7 +108,7 @@ def explore(
     if size > LIMIT:
         raise ValueError(
             f"values: {t.size} times at {int(inside.sum())} nodes take {size / 1024**2:.0f} MiB; expected at most "
-            f"{LIMIT // 1024**2}, which a browser can open. Show fewer times, one slice, or part of the domain"
+            f"{LIMIT // 1024**2} MiB, which a browser can open. Show fewer times, one slice, or part of the domain"
         )
     # (4πt)^(d/2)·HKS is of order 1 in any unit, so float32 does not underflow.
     scale = result.flat_scale if result.normalisation == "raw" else 1.0
