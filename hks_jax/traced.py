@@ -15,4 +15,4 @@ def is_traced(tree: Any) -> bool:
 
 def is_staged() -> bool:
     """Return whether every operation is staged for a later computation, so that it returns a tracer."""
-    return is_traced(jax.lax.stop_gradient(_CONSTANT))
+    return is_traced(jax.lax.stop_gradient(_CONSTANT))  # an operation that, unless staged, runs nothing
