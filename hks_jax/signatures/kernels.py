@@ -7,9 +7,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from hks_jax.checks import require_number, require_real
+from hks_jax.compilation import numpy_where_known
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Custom, Derivative, Heat, Wave
 from hks_jax.signatures.spectral_functions import source_indices, spectral_columns, spectral_diagonal, spectral_trace
@@ -123,14 +124,12 @@ def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Arr
     return spectral_diagonal(pairs, bells, 1 / spectral_trace(pairs, bells))
 
 
-@jax.jit
-def _largest_exponents(
-    energies: Float[Array, " n"], sigma: Float[Array, ""], values: Float[Array, " k"], kept: Bool[Array, " k"]
-) -> Float[Array, " n"]:
+@numpy_where_known()
+def _largest_exponents(xp: Any, energies: Any, sigma: Any, values: Any, kept: Any) -> Any:
     positive = kept & (values > 0)
-    logs = jnp.log(jnp.where(positive, values, 1))
-    exponents = jnp.where(positive[None], -jnp.square((energies[:, None] - logs[None]) / sigma) / 2, -jnp.inf)
-    return jnp.max(exponents, axis=1)
+    logs = xp.log(xp.where(positive, values, 1))
+    exponents = xp.where(positive[None], -(((energies[:, None] - logs[None]) / sigma) ** 2) / 2, -xp.inf)
+    return xp.max(exponents, axis=1)
 
 
 def spectral_signature(

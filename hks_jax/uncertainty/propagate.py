@@ -3,7 +3,6 @@
 import math
 import os
 from collections.abc import Callable
-from functools import partial
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -171,14 +170,12 @@ def uncertainty(
     variance = jax.tree.map(lambda odd: odd / samples, moments.odd)
     spread = jax.tree.map(lambda s: s / (samples - 1), moments.spread)
     freedom: float = samples * (_BALANCED - 1)
-    if method != "resample":
-        freedom = math.inf if method == "exact" else draws
-        rule = _exact if method == "exact" else partial(_linear, draws=draws)
-        variance = rule(whole, measured, noise, seed)
+    if method == "exact":
+        freedom, variance = math.inf, _exact(whole, measured, noise)
+    elif method == "linear":
+        freedom, variance = draws, _linear(whole, measured, noise, seed, draws)
     freedom = 1 / (1 / freedom + 1 / noise.freedom) if min(freedom, noise.freedom) < math.inf else math.inf
-    smear = None
-    if smoothing:
-        smear = jax.tree.map(jnp.subtract, run(smoothed(measured)), value)
+    smear = jax.tree.map(jnp.subtract, run(smoothed(measured)), value) if smoothing else None
     result = Uncertainty(
         value,
         jax.tree.map(jnp.sqrt, variance),
@@ -235,8 +232,8 @@ def _positive(measured: Array, noisy: Array) -> tuple[Array, Array]:
 
     Nodes whose tensor is not positive definite without noise, as outside a mask, are ignored.
     """
-    valid = jnp.isfinite(spd.positive_or_nan(measured)).all(axis=(-2, -1))
-    bad = valid & ~jnp.isfinite(spd.positive_or_nan(noisy)).all(axis=(-2, -1))
+    valid = spd.is_positive(measured)
+    bad = valid & ~spd.is_positive(noisy)
 
     def raised(noisy: Array) -> Array:
         values, vectors = spd.eigh(noisy)
@@ -314,14 +311,14 @@ def _sampled(
     return moments
 
 
-def _exact(function: Callable[[Array], Any], D: Array, noise: TensorNoise, seed: int) -> Any:
+def _exact(function: Callable[[Array], Any], D: Array, noise: TensorNoise) -> Any:
     """Return the variance gᵀΣg of every number of the result by a reverse-mode product for each."""
 
     @jax.jit
     def squares(D: Array, noise: TensorNoise) -> Any:
         value, pull = jax.vjp(function, D)
         flat, unravel = ravel_pytree(value)
-        back = jax.linear_transpose(noise.tensors, _white(noise, seed, 0, D.dtype))
+        back = jax.linear_transpose(noise.tensors, jax.ShapeDtypeStruct(noise.white_shape, D.dtype))
         ones = jnp.eye(flat.size, dtype=flat.dtype)
         return unravel(jax.lax.map(lambda one: jnp.sum(back(*pull(unravel(one)))[0] ** 2), ones))
 
