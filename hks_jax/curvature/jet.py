@@ -34,7 +34,7 @@ def stencils(order: int) -> tuple[np.ndarray, np.ndarray]:
     weights = np.zeros((len(runs), MINIMUM_NODES))
     for row, run in enumerate(runs):
         for column, node in enumerate(run):
-            # The derivative at 0 of the Lagrange polynomial of this node; products of small integers are exact.
+            # The weight is the derivative at 0 of the node's Lagrange polynomial; products of small integers are exact.
             others = run[run != node]
             offsets[row, column] = node
             weights[row, column] = factorial(order) * np.poly(others)[-1 - order] / np.prod(node - others)
@@ -49,7 +49,7 @@ def differentiate(
     spacing: float,
     wraps: bool,
 ) -> tuple[Float[Array, "*shape_and_components"], Bool[np.ndarray, "*shape"]]:
-    """Return the first or second derivative of nodal values along a grid axis, and the nodes where it is known.
+    """Return the first or second derivative of nodal values along a grid axis, and the nodes where this is known.
 
     Only values at nodes inside the domain are used. The derivative is 0 where no stencil lies inside.
     """
@@ -155,7 +155,7 @@ def inner(inverse: Float[Array, "... d d"], p: Float[Array, "... d"], q: Float[A
 
 
 def metric_function(field: TensorField) -> Callable[[Array], Array]:
-    """Return the field's function, symmetrised, in the dtype of its argument; NaN if it is not positive definite."""
+    """Return the field's function with symmetric values in the dtype of its argument; NaN if not positive definite."""
     function = field.function
     assert function is not None
     return lambda x: spd.positive_or_nan(spd.symmetrise(jnp.asarray(function(x), x.dtype)))

@@ -279,7 +279,7 @@ def phantom(
 ) -> tuple[Float[np.ndarray, "*shape d d"], Bool[np.ndarray, "*shape"], tuple[float, ...]]:
     """Return diffusion tensors of a phantom that resembles an axial slice of a brain, or a stack of such slices.
 
-    The phantom has a folded cortex of grey matter, and two ventricles. Its white matter has a corpus callosum, an arc
+    The phantom has a folded cortex of grey matter, and two ventricles. The white matter has a corpus callosum, an arc
     of fibres on each side, and crossings of callosum and arcs.
 
     Args:

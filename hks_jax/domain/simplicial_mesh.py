@@ -159,7 +159,7 @@ class TetMesh(SimplicialMesh):
     A mesh is a pytree: its leaves are the vertex positions and the given metric, if any. The connectivity is static.
 
     Tetrahedra must be positively oriented, (v₁ − v₀) × (v₂ − v₀) · (v₃ − v₀) > 0, as in VTK and Gmsh. So an inverted
-    tetrahedron is an error, for example after moving a vertex. Under `jit` it gives NaN instead.
+    tetrahedron is an error, for example after moving a vertex. Under `jit` an inverted tetrahedron gives NaN instead.
 
     Args:
         vertices: positions (V, 3).

@@ -82,10 +82,10 @@ _POWER, _REACH = 3, 9.0
 # Σₜ wₜ a(tL)², where L is the Laplacian. Except for the first few, the eigenvalues of JᵀJ decrease as those of L
 # increase. On a grid they decrease faster, because interpolation between nodes damps oscillations of the factor.
 class ConformalInformation(eqx.Module):
-    """B½ (1 + L/λ₁)⁻³ B½ for JᵀJ, with the lumped mass B and a Laplacian L of the initial metric by differences.
+    """The preconditioner B½ (1 + L/λ₁)⁻³ B½, where B is the lumped mass and L is a Laplacian of the initial metric.
 
     The inverse is a polynomial of L, which takes three products with L. The eigenvalues of JᵀJ + μB are at least about
-    μ. λ₁ is so large that the same holds for the preconditioner.
+    μ. So are the eigenvalues of the preconditioner, because λ₁ is large enough.
     """
 
     unknowns: Nodal  # the conformal factors at the nodes

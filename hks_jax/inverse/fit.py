@@ -41,9 +41,9 @@ def fit_metric(
     """Find a metric with a given signature.
 
     The fit minimises half the weighted mean square of the differences between predicted and given signature, plus the
-    penalties of the regularisers. Isometric metrics have the same signature, and high frequencies affect it little. So
-    the steps are damped and, by default, smooth. Steps first change the directions that the data determine. The result
-    states how the fit ended; a fit that stalls or is interrupted raises no error.
+    penalties of the regularisers. Isometric metrics have the same signature, and high frequencies of a metric affect
+    its signature little. So the steps are damped and, by default, smooth. Steps first change the directions that the
+    data determine. The result states how the fit ended; a fit that stalls or is interrupted raises no error.
 
     Args:
         init: the initial metric: a field, or a grid for the flat metric. The fit keeps properties of the field that the

@@ -36,7 +36,7 @@ class Identifiability(eqx.Module):
             determine.
         deviation: (nodes,) the posterior standard deviation of each node's unknowns (root mean square) from the n
             directions. To first order it is an upper bound on the exact deviation under a white prior, that is, for
-            independent unknowns with standard deviation τ. A prior that couples neighbours reduces it.
+            independent unknowns with standard deviation τ. A prior that couples neighbours reduces the deviation.
         effective: the number of unknowns that the data determine, Σ s²/(s² + σ²/τ²) over the n directions.
         noise: the standard deviation σ of the residuals.
         prior: the standard deviation τ of the prior.

@@ -40,10 +40,10 @@ class Data:
             predicted and target values to residuals.
         weights: numbers ≥ 0 that broadcast to the target's shape; 0 at unobserved entries, where the target may be NaN.
         noise: the standard deviation of the residuals (0.01 for 1 % under ``"log"``). The fit stops when the misfit
-            reaches this level (the discrepancy principle), which regularises it.
+            reaches this level (the discrepancy principle), which regularises the fit.
         deviation: the standard deviation of the target's noise in the target's unit, broadcast to its shape, for
-            example from `hks_jax.uncertainty`. The weights are multiplied by its inverse square, and by default `noise`
-            follows from it. Correlations of the noise are ignored.
+            example from `hks_jax.uncertainty`. The weights are divided by the square of the deviation, and by default
+            `noise` follows from the deviation. Correlations of the noise are ignored.
 
     Raises:
         ValueError: if the signature or loss is unknown, if the noise is not positive, or if a function as loss has a

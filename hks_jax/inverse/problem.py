@@ -79,7 +79,7 @@ class Problem(eqx.Module):
 # A heat signature is at least the contribution of the constant eigenfunctions. Other signatures, and heat signatures
 # without constant eigenfunctions, may underflow in single precision, and derivatives of logarithms divide by them.
 def _residuals_of(observation: Observation, pairs: Eigenpairs, solver: str | Eigensolver) -> Float[Array, " m"]:
-    """Return the residuals. Their derivative is in single precision if the solver's derivative is no more accurate."""
+    """Return the residuals, with a derivative in single precision if the solver's derivative is no more accurate."""
     rough = isinstance(solver, Eigensolver) and solver.adjoint.tolerance >= _ENOUGH
     bounded = observation.signature.left_out is not None and pairs.n_null > 0
     return (_rough if rough and bounded else Observation.residuals)(observation, pairs)

@@ -38,9 +38,9 @@ class Search:
             three times as many products. Directions that the products do not reach are ignored; `identifiability` finds
             them. Solvers of optimistix test only the last step.
         max_steps: the maximum number of steps in each stage.
-        continuation: the number of stages. The first fits only the largest times, the last fits all times.
+        continuation: the number of stages. The first stage fits only the largest times, the last stage fits all times.
         starts: the number of starts, first from the initial field and then from random smooth changes of it. The best
-            is returned.
+            result is returned.
         spread: the root mean square of the random changes, in the parameters' units.
         seed: the seed of the random changes.
 

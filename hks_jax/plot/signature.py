@@ -40,8 +40,8 @@ def signature_panels(
     """Return a figure of a signature on a slice, or on three slices of a volume, with separate colours for each time.
 
     The colours span the values away from the boundary, and a colour bar has arrows if other values lie beyond. With
-    "flat" normalisation they diverge from 1, the value for a flat metric, unless most values are far above 1. With
-    error bars, deviations within the noise fade. Titles contain √(Dt), the distance of diffusion, if it is known.
+    "flat" normalisation the colours diverge from 1, the value for a flat metric, unless most values are far above 1.
+    With error bars, deviations within the noise fade. Titles contain √(Dt), the distance of diffusion, if it is known.
 
     Args:
         result: the signature to draw.

@@ -27,8 +27,9 @@ def heat_flow(pairs: Eigenpairs, times: Any, functions: Any) -> Float[Array, "n_
     tensors. The result is NaN outside the mask, and 0 at Dirichlet nodes.
 
     Args:
-        pairs: the result of `eigenpairs`. Their boundary conditions also hold for u. Values of u at Dirichlet nodes are
-            not used. ``"mirror"`` and ``"mean"`` extend u evenly, which gives the same flow as ``"neumann"``.
+        pairs: the result of `eigenpairs`. The boundary conditions of the pairs also hold for u. Values of u at
+            Dirichlet nodes are not used. ``"mirror"`` and ``"mean"`` extend u evenly, which gives the same flow as
+            ``"neumann"``.
         times: (n_times,) positive, in (metric length)².
         functions: (*shape), or (…, *shape) for several functions; values outside the mask are not used.
 
@@ -115,7 +116,7 @@ def tensor_invariants(field: TensorField) -> dict[str, Float[np.ndarray, "*shape
 def gaussian_scale_space(
     field: TensorField, times: Any, functions: Any
 ) -> Float[np.ndarray, "n_times *functions_and_shape"]:
-    """Blur functions by an isotropic Gaussian of constant width, to which heat spreads on average.
+    """Blur functions by an isotropic Gaussian, whose constant width is the mean width to which heat spreads.
 
     In coordinates the standard deviation is √(2t/s), where s is the mean of |T|^(1/d) over the domain. Division by the
     blurred mask and reflection at the sides of the grid preserve constant functions. The result is NaN outside the

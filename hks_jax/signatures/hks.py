@@ -244,8 +244,8 @@ def boundary_influence(
     rim of a mask. At a distance d from a straight side of a flat domain the ratio is exp(−d²/t). The ratio is 1 on the
     boundary, 0 where neither condition has an effect yet, and NaN outside the mask.
 
-    The result is differentiable with respect to the tensors. Two problems are solved for eigenpairs. Together they are
-    the problem with the boundary ``"mean"``, whose signature is (k_N + k_D)/2.
+    The result is differentiable with respect to the tensors. Eigenpairs of two problems are computed. Together the two
+    problems are the problem with the boundary ``"mean"``, whose signature is (k_N + k_D)/2.
 
     Args:
         domain: a metric in 2D or 3D, a mesh, or eigenpairs with the boundary ``"mean"``, which contain both problems.

@@ -101,9 +101,9 @@ def log_determinant(
     """Compute log det′ Δ = −ζ′(0), where ζ(s) = Σ λᵢ^(−s) is the sum over the positive eigenvalues.
 
     The heat trace's expansion at small times accounts for the eigenvalues that were not computed. The result is
-    differentiable with respect to the eigenvalues and the coefficients. Errors of the eigenvalues limit its accuracy:
-    for linear elements with spacing h in 2D the error is about a₀h²/16T². So small T, which need many pairs, need fine
-    grids.
+    differentiable with respect to the eigenvalues and the coefficients. Errors of the eigenvalues limit the accuracy:
+    for linear elements with spacing h in 2D the error is about a₀h²/16T². So a small T requires many pairs and a fine
+    grid.
 
     Args:
         pairs: the lowest eigenpairs, from `eigenpairs`.

@@ -174,7 +174,7 @@ def _tangent(
     """Return the derivative for the change of one part, given its pairs and the derivative of their frame."""
     values, vectors, kept, d_frame = (x if selection is None else x[selection[0]] for x in (*pairs, d_frame))
     if selection is not None:
-        vectors = jnp.where(selection[1][:, None], vectors, 0)  # pairs of other parts do not mix with these
+        vectors = jnp.where(selection[1][:, None], vectors, 0)  # pairs of different parts do not mix
     if not len(vectors):
         return jnp.zeros_like(contraction.weighted(_all_weights(filters, values, kept), vectors))
     d_frame = jnp.where(kept[:, None], d_frame, 0)  # d_frame may be NaN where pairs are not kept

@@ -141,7 +141,7 @@ def default_k(dimension: int, unknowns: int) -> int:
 def suitable(metric: Any, spacing: Any, inside: Bool[np.ndarray, "*shape"], boundary: BoundarySpec) -> dict[str, float]:
     """Return the times and k that suit a metric on a grid; see `suitable_times`.
 
-    The metric (n, d, d) is given at the nodes inside the domain or at a representative sample of them.
+    The metric (n, d, d) is given at the nodes inside the domain or at a representative sample of these nodes.
     """
     metric, spacing = np.asarray(metric), np.asarray(spacing)
     d, share = len(spacing), inside.sum() / len(metric)

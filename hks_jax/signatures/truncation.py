@@ -96,8 +96,8 @@ class Truncation(eqx.Module):
 def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]) -> Truncation:
     """Estimate the truncation error of k pairs and the discretisation error of the signature at each time.
 
-    Weyl's law N(λ) = k (λ/Λ)^(d/2), where Λ is the first eigenvalue beyond the k, gives the part of the heat trace
-    beyond Λ. This part is a mean over the domain; `truncation_map` estimates the error at each node.
+    Weyl's law N(λ) = k (λ/Λ)^(d/2), where Λ is the first eigenvalue beyond the k pairs, gives the part of the heat
+    trace beyond Λ. This part is a mean over the domain; `truncation_map` estimates the error at each node.
 
     The discretisation error has two parts of leading order in the spacing h. The first part is d h²/48t for a constant
     metric whose axes are those of the grid, and larger otherwise. The second part does not decrease with t: where
@@ -283,13 +283,14 @@ def truncation_map(
 
     `truncation` estimates the mean over the domain. A single node beside a Dirichlet side, in its corners, or where
     tensors vary between nodes can lack several times as much. Here Weyl's law is local: the function N(λ, x) = Σ φᵢ(x)²
-    over λᵢ < λ is approximated by N(Λ, x) (λ/Λ)^a(x), where Λ is the first eigenvalue beyond the k. The pairs determine
-    N(Λ, x). The mean of λ at the node, which is Λ a/(a + 1), determines the exponent a(x). The exponent is about d/2
-    inside and at Neumann sides, and d/2 + 1 at a Dirichlet side.
+    over λᵢ < λ is approximated by N(Λ, x) (λ/Λ)^a(x), where Λ is the first eigenvalue beyond the k pairs. The pairs
+    determine N(Λ, x). The mean of λ at the node, which is Λ a/(a + 1), determines the exponent a(x). The exponent is
+    about d/2 inside and at Neumann sides, and d/2 + 1 at a Dirichlet side.
 
     The result is an estimate, not a bound. On small grids the largest true share of a node was 0.25 to 2 times the
     largest estimate if the mean exceeded 0.1 %, and up to 3 times the estimate if the mean was 1e-6. The result is NaN
-    outside the mask, and 0 at Dirichlet nodes and if all pairs were computed. Derivatives treat it as a constant.
+    outside the mask, and 0 at Dirichlet nodes and if all pairs were computed. Derivatives treat the result as a
+    constant.
 
     Args:
         times: (n_times,) positive, in (metric length)².

@@ -121,7 +121,7 @@ class TensorNoise(eqx.Module):
         from all nodes inside the mask. A median gives the size of the covariance; the correlation of neighbours along
         the axes gives the length. The scans must be aligned, and their noise must be independent and have the same
         covariance. The estimate of the noise includes the effect of motion between the scans.
-        The mean of both scans has half the covariance.
+        The mean of both scans has half this covariance.
 
         Args:
             first: (*shape, d, d), the tensors of the first scan.

@@ -101,9 +101,10 @@ def uncertainty(
         bars = hj.uncertainty(signature, D, hj.TensorNoise.relative(D, 0.1))
         bars.deviation, bars.bias, bars.interval(0.95), bars.z(1.0), bars.summary()
 
-    Four samples δ of the noise with sum zero are drawn at a time, and maps of D + δ/2 are computed. Their differences
-    give three samples of the error of the value, and their mean gives the bias. The noise is halved, because the
-    measured tensors already contain noise. The relative error of a deviation is 29 % with 8 draws, and 8 % with 100.
+    Four samples δ of the noise with sum zero are drawn at a time, and maps of D + δ/2 are computed. The differences of
+    the maps give three samples of the error of the value, and the mean of the maps gives the bias. The noise is halved,
+    because the measured tensors already contain noise. The relative error of a deviation is 29 % with 8 draws, and 8 %
+    with 100 draws.
 
     Args:
         function: maps tensors (*shape, d, d) to an array, or to a pytree of arrays. JAX must be able to trace the
@@ -119,9 +120,11 @@ def uncertainty(
         smoothing: the standard deviation, in coordinate units, of a Gaussian that smooths the tensors before the
             function is evaluated (see `smooth_tensors`); the noise must have a grid. 0 for no smoothing.
         seed: the seed of the random numbers.
-        compiled: whether to compile the function once for all draws. False calls it directly, without tracing.
+        compiled: whether to compile the function once for all draws. If false, the function is called directly, without
+            tracing.
         progress: a function that is called with a short text after every four maps.
-        checkpoint: a file that is written after every four maps. If it exists, resampling continues from its state.
+        checkpoint: a file that is written after every four maps. If the file exists, resampling continues from its
+            state.
         each: a function that is called with each sample of the noise of the value, three times for four maps, for
             example to compute covariances or errors of means. The function is not called for the samples of a
             checkpoint.
