@@ -52,15 +52,13 @@ def gaussian_curvature(field: TensorField, periodic: bool | Sequence[bool] = Fal
 
     If the field was made from a function, K is exact, from JAX derivatives. Otherwise K comes from finite differences
     of sixth order of the nodal tensors, which are one-sided near the edges of the grid and the mask. K is NaN outside
-    the mask, and where no stencil of 7 nodes along a grid line fits into the mask (8 for a second derivative near an
-    edge).
+    the mask, and where no stencil of 7 nodes along a grid line fits into it (8 for second derivatives near an edge).
 
     Args:
         periodic: whether the axes are periodic (node n is node 0), one value for all or one per axis.
 
     Raises:
-        ValueError: a field that is not two-dimensional; fewer than 8 nodes along an axis of a nodal field; a bad
-            `periodic`.
+        ValueError: a field that is not 2D; fewer than 8 nodes along an axis of a nodal field; a bad `periodic`.
 
     Examples:
         >>> K = hj.gaussian_curvature(hj.examples.sphere_field(9))

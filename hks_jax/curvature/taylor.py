@@ -20,8 +20,8 @@ Series = Float[Array, " _n_terms"]
 def expand(fn: Callable[[Array], Array], x: Float[Array, " 2"], degree: int) -> Float[Array, "*components n_terms"]:
     """Return the Taylor series of a function at a point, exact to rounding.
 
-    Derivatives along a line are cheap, because the function then depends on one variable. The derivatives along degree
-    + 1 lines determine the mixed derivatives: Dᵏf along (c, s) is k! Σⱼ cᵏ⁻ʲ sʲ fₖⱼ. For equidistant angles this is
+    Derivatives along a line are cheap, because only one variable changes. The derivatives along degree + 1 lines
+    determine the mixed derivatives: Dᵏf along (c, s) is k! Σⱼ cᵏ⁻ʲ sʲ fₖⱼ. For equidistant angles this is
     well-conditioned.
     """
     angles = np.pi * np.arange(degree + 1) / (degree + 1)

@@ -65,8 +65,7 @@ def label_nodes(mask: Bool[np.ndarray, "*shape"], periodic: tuple[bool, ...]) ->
     """
     elements = active_elements(mask, periodic)
     # Elements that share a node are connected, whereas two neighbouring nodes need not share an element. So elements
-    # are labelled first, and each node takes the label of its elements. Elements that share a node across a periodic
-    # side are connected, too.
+    # are labelled first, and nodes take the labels of their elements. Nodes on periodic sides connect elements, too.
     labels, count = scipy.ndimage.label(elements, structure=np.ones((3,) * mask.ndim, dtype=bool))
     nodes = element_nodes(labels, periodic)
     if any(periodic) and count > 1:

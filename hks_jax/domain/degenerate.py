@@ -32,8 +32,7 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
     zeros are merged into one point with the sum of their indices (Tricoche, Scheuermann and Hagen 2001).
 
     Points of index 0, pairs of opposite index that are closer than `merge`, and points on the rim of the domain are not
-    found. If eigenvalues are equal on a curve or in a region away from the rim, the centre of that set is returned
-    unless its index is 0.
+    found. If eigenvalues are equal on a curve or in a region off the rim, its centre is returned unless its index is 0.
 
     Args:
         field: a 2D field. Cells with a node outside the mask are not part of the domain.
@@ -73,8 +72,7 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
     graph = coo_matrix((np.ones(len(near)), near.T), shape=(len(cells),) * 2)
     count, cluster = connected_components(graph, directed=False)
     turns = winding[tuple(cells.T)]
-    # Several cells share a zero on an edge or node. The number of turns in each of these cells is arbitrary, but their
-    # sum is not.
+    # Several cells share a zero on an edge or node. The turns in each cell are arbitrary, but their sum is not.
     index = np.bincount(cluster, turns, count) / 2
     settled = np.bincount(cluster, on_rim[tuple(cells.T)], count) == 0
     shared = crossed[tuple(cells.T)]

@@ -140,8 +140,7 @@ def _stereographic(x: Float[Array, " 2"], sign: float) -> Float[Array, "2 2"]:
 def sphere_field(n: int, half_width: float = 3.0) -> TensorField:
     """Return the unit sphere (K = 1) in its stereographic chart, with n × n nodes on (−half_width, half_width)².
 
-    The midpoints of the sides have the distance 2 arctan(half_width) from the centre. A region around the other pole is
-    missing.
+    The sides' midpoints are 2 arctan(half_width) away from the centre; a region around the other pole is missing.
 
     Examples:
         >>> print(hj.gaussian_curvature(hj.examples.sphere_field(9))[4, 4].round(3))

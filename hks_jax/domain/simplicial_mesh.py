@@ -126,8 +126,8 @@ class SurfaceMesh(SimplicialMesh):
     Args:
         vertices: positions (V, 3).
         faces: vertex indices (F, 3).
-        metric: (F, 2, 2), the metric of each triangle in the basis of its edges v₁ − v₀ and v₂ − v₀, in place of the
-            induced metric.
+        metric: (F, 2, 2), the metric of triangles in the basis of edges v₁ − v₀ and v₂ − v₀, in place of the induced
+            metric.
         mask: bool, True inside the domain: (F,) for the triangles, or (V,) for the vertices. A triangle is inside if
             all of its vertices are. Triangles outside may be degenerate or NaN. The rim of the mask belongs to the
             boundary, results are NaN at vertices outside, and ``faces`` has only the triangles inside.

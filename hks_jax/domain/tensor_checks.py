@@ -163,8 +163,7 @@ def positive_map(
     """Return exp(S/s) or S + c·I of symmetric tensors S; outside the mask S is replaced by the identity.
 
     Raises:
-        ValueError: an unknown map; NaN, infinite or unsymmetric tensors; an invalid scale or shift; a result that is
-            not positive definite.
+        ValueError: an unknown map; NaN, infinite or unsymmetric tensors; an invalid scale or shift; a singular result.
     """
     if how not in NUMBERS:
         choices = " or ".join(f'"{choice}" ({does})' for choice, does in MAPS.items())

@@ -39,10 +39,9 @@ class TensorField(eqx.Module):
         tensors: (*shape, d, d), symmetric positive definite inside the mask; ``tensors[i, j, 0, 1]`` is T₁₂ at node
             (i, j). Units: (length / coordinate unit)². Values outside the mask are ignored.
         interpolation: the interpolation between the nodes. With ``"linear"`` the components are multilinear, as in
-            Zobel, Reininghaus and Hotz; if tensors rotate from node to node, the determinant is larger between the
-            nodes. With ``"log-euclidean"`` the components of the logarithm are multilinear (Arsigny, Fillard, Pennec
-            and Ayache). Then the logarithm of the determinant is multilinear, and T⁻¹ is interpolated in the same way
-            as T.
+            Zobel, Reininghaus and Hotz; if tensors rotate from node to node, the determinant is larger in between. With
+            ``"log-euclidean"`` the components of the logarithm are multilinear (Arsigny, Fillard, Pennec and Ayache).
+            Then the logarithm of the determinant is multilinear, and T⁻¹ is interpolated in the same way as T.
 
     Raises:
         ValueError: a wrong shape; tensors that are NaN, infinite, unsymmetric or not positive definite inside the mask
@@ -71,9 +70,8 @@ class TensorField(eqx.Module):
     ) -> "TensorField":
         """Return the metric ``fn``, which maps coordinates (d,) to a tensor (d, d) and is differentiable by JAX.
 
-        The field keeps the function, so that curvature and its derivatives are exact; `assemble` evaluates the function
-        at the nodes and interpolates between them. Parameters that should be traced belong in a `jax.tree_util.Partial`
-        or an Equinox module.
+        The field keeps the function, so that curvature and its derivatives are exact; `assemble` interpolates between
+        its values at the nodes. Traced parameters belong in a `jax.tree_util.Partial` or an Equinox module.
 
         Examples:
             >>> grid = hj.Grid.from_bounds(1, 2, (9, 9))
@@ -115,8 +113,7 @@ class TensorField(eqx.Module):
         - ``"tensor"``: g = D, as in Zobel, Reininghaus and Hotz;
         - ``"adjugate"``: g = |D| D⁻¹, the inverse scaled so that |g| = |D|^(d−1).
 
-        The metric g is interpolated between the nodes. With ``"log-euclidean"`` the result is the same as if D were
-        interpolated.
+        The metric g is interpolated between the nodes. With ``"log-euclidean"``, interpolating D would give the same.
 
         Examples:
             >>> metric = hj.TensorField.from_diffusion(field.grid, field.tensors, metric="inverse")
@@ -136,12 +133,11 @@ class TensorField(eqx.Module):
         """Return the metric C = FᵀF of a deformation gradient F (*shape, d, d), the right Cauchy–Green tensor.
 
         ``F[..., i, j]`` is ∂yᵢ/∂xⱼ, where y is the position to which the point x moves, or would move without
-        constraints. The metric measures lengths after the deformation. A rotation after the deformation does not change
-        the metric.
+        constraints. The metric measures lengths after the deformation. A later rotation does not change it.
 
         If F is the gradient of a map, the metric is flat, and the signature is the signature of the deformed body. For
-        growth, plastic or elastic strain, the curvature of C is the incompatibility, or residual strain. See
-        docs/strain.md.
+        growth, plastic or elastic strain, the curvature of C is the incompatibility, or residual strain
+        (docs/strain.md).
 
         Args:
             grid: the grid of the undeformed coordinates x.
@@ -188,8 +184,8 @@ class TensorField(eqx.Module):
             S: the tensors; values outside the mask are ignored.
             how: ``"exp"`` or ``"shift"``.
             number: the scale or the shift; may be traced.
-            interpolation: the interpolation of g between the nodes. With ``"exp"``, ``"log-euclidean"`` interpolates S
-                linearly.
+            interpolation: the interpolation of g between nodes. With ``"exp"``, ``"log-euclidean"`` is linear
+                interpolation of S.
             name: the name of S in messages.
 
         Raises:

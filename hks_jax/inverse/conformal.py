@@ -36,8 +36,7 @@ class InnerProduct(eqx.Module):
 class Smoothing(InnerProduct):
     """The inner product ⟨x, y⟩ + ℓ²⟨∇x, ∇y⟩ of each component, where ℓ is the length below which steps are smooth.
 
-    The inner product contains the mass matrix, because a node at the boundary has only half a cell and affects the data
-    less.
+    The inner product has a mass matrix, because a node at the boundary has only half a cell and affects the data less.
     """
 
     pencil: Pencil  # stiffness and lumped mass of the flat metric

@@ -65,8 +65,7 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _State]):
     The settings are arrays, so a compiled step works for all their values.
 
     Args:
-        tolerance: the relative and absolute change of the unknowns (root mean square) at which the solver stops; see
-            `Search`.
+        tolerance: the relative and absolute change of the unknowns (root mean square) at which the solver stops.
         damping: the damping μ of the first step, relative to the scale of the data.
         growth: the divisor of μ after a step that reduces the misfit as much as its linearisation predicts.
         inner_product: the inner product B, in whose norm steps are damped.

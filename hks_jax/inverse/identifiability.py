@@ -32,8 +32,7 @@ class Identifiability(eqx.Module):
         directions: (n, *values) their eigenvectors, normalised.
         weak_strengths: (n_weak,) upper estimates of the smallest eigenvalues in ascending order.
         weak_directions: (n_weak, *values) the directions that the data determine least.
-        resolution: (nodes,) a lower bound, from the n directions, on the share of each node's unknowns that the data
-            determine.
+        resolution: (nodes,) a lower bound, from n directions, on the share of each node's unknowns that data determine.
         deviation: (nodes,) the posterior standard deviation of each node's unknowns (root mean square) from the n
             directions. To first order it is an upper bound on the exact deviation under a white prior, that is, for
             independent unknowns with standard deviation τ. A prior that couples neighbours reduces the deviation.

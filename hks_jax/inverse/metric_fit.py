@@ -34,8 +34,7 @@ class Step:
     """One step of a fit.
 
     Attributes:
-        step: the number of the step, where 0 belongs to the initial unknowns. Solvers of optimistix report only
-            accepted steps.
+        step: the number of the step; 0 belongs to the initial unknowns. Optimistix reports only accepted steps.
         loss: half the weighted mean square of the residuals, plus the penalties.
         misfit: the data's part of the loss.
         gradient: the norm of the loss's gradient; NaN for least squares solvers of optimistix, which do not compute it.
@@ -93,8 +92,7 @@ class MetricFit:
         values: the unknowns of the parametrisation.
         problem: the least squares problem, for `identifiability` and for custom fits.
         losses: the loss of each start.
-        noise: the standard deviation of the residuals, as stated or as it follows from the target's deviation;
-            otherwise None.
+        noise: the standard deviation of the residuals, as stated or from the target's deviation; otherwise None.
     """
 
     field: TensorField

@@ -46,7 +46,7 @@ class Data:
             `noise` follows from the deviation. Correlations of the noise are ignored.
 
     Raises:
-        ValueError: if the signature or loss is unknown, if the noise is not positive, or if a function as loss has a
+        ValueError: if the signature or loss is unknown, if the noise is not positive, or if a loss function has a
             deviation.
 
     Examples:

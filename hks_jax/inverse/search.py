@@ -39,8 +39,7 @@ class Search:
             them. Solvers of optimistix test only the last step.
         max_steps: the maximum number of steps in each stage.
         continuation: the number of stages. The first stage fits only the largest times, the last stage fits all times.
-        starts: the number of starts, first from the initial field and then from random smooth changes of it. The best
-            result is returned.
+        starts: the number of starts, first from the initial field, then from random smooth changes. The best is kept.
         spread: the root mean square of the random changes, in the parameters' units.
         seed: the seed of the random changes.
 

@@ -1,7 +1,6 @@
 """Violations of the triangle inequality by edge lengths in the metric, a remark of the paper.
 
-The remark concerns discrete exterior calculus. Diagonals cut the grid's cells into triangles, and `LENGTHS` has rules
-for edge lengths.
+The remark concerns discrete exterior calculus. Diagonals cut cells into triangles; `LENGTHS` has rules for lengths.
 """
 
 from collections.abc import Callable

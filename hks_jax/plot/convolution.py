@@ -29,8 +29,7 @@ def lic_texture(
 
     An eigenvector has no sign, so each step takes the sign that continues the line. The average has bell-shaped
     weights. The average is divided by its standard deviation and mapped by the normal distribution function to uniform
-    numbers in (0, 1), for any number of pixels. So the contrast is the same where lines end, at degenerate points and
-    boundaries.
+    numbers in (0, 1). So the contrast is the same where lines end, at degenerate points and boundaries.
 
     Args:
         field: a 2D field.

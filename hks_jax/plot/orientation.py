@@ -21,8 +21,8 @@ class Orientation(NamedTuple):
     """The directions of an array's axes in space, by which its image is turned.
 
     The image does not depend on the storage order of the voxels. In the order left–right, back–front, foot–head its
-    horizontal axis precedes its vertical axis, and letters at its edges name the directions. The radiological view
-    swaps left and right.
+    horizontal axis precedes its vertical axis, and letters at its edges name the directions. The radiological view is
+    mirrored.
 
     Attributes:
         axes: the array's axis for each axis of the image.

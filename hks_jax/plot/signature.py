@@ -103,8 +103,7 @@ def titles_of(result: Result) -> Sequence[str]:
 def _colours(result: Result, inside: Bool[np.ndarray, "*shape"]) -> list[Colours]:
     """Return the colours for each time, which span nearly all values away from the boundary."""
     rim = normalise_boundary(result.settings.get("boundary", "neumann"), inside.ndim)[-1]
-    # With "mean" values near the boundary are as elsewhere, except at corners and, in a volume, in thin parts of the
-    # mask.
+    # With "mean" the boundary has no effect, except at corners and, in a volume, in thin parts of the mask.
     deep = inside if "mean" in rim and inside.ndim == 2 else away_from_rim(inside)
     span = (0.01, 0.99) if "mean" in rim else SPAN
     centre = 1.0 if result.normalisation == "flat" else None

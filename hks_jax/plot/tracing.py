@@ -1,8 +1,7 @@
 """Integral lines of the eigenvector fields of a 2D tensor field.
 
 An eigenvector has no sign, but the tensor is unambiguous. So the tensors at the nodes are interpolated bilinearly. The
-direction at a point follows from the interpolated tensor in closed form, and its sign from the line's previous
-direction.
+direction at a point follows from the interpolated tensor in closed form, and its sign from the previous direction.
 """
 
 from typing import Any, Literal
@@ -37,8 +36,7 @@ class DirectionField:
         grid = field.grid
         tensors = np.asarray(field.domain_tensors, dtype=np.float64)
         self.which = which
-        # (a, b) is λ₁ − λ₂ times (cos 2θ, sin 2θ) for the major angle θ. Division by the trace makes (a, b)
-        # dimensionless.
+        # (a, b) is λ₁ − λ₂ times (cos 2θ, sin 2θ) for the major angle θ. Division by the trace removes the unit.
         difference = tensors[..., 0, 0] - tensors[..., 1, 1]
         components = np.stack([difference, 2 * tensors[..., 0, 1], np.trace(tensors, axis1=-2, axis2=-1)], -1)
         components[~grid.inside] = np.nan

@@ -63,14 +63,12 @@ def orthogonal_slices(
         node: the indices (i, j, k) of the node. If it has no value, the nearest node with a value is used. By default
             `middle_node` of the finite values.
         cross: whether thin lines show the positions of the other two slices.
-        orientation: the orientation of the grid in space, which turns the slices and adds space coordinates and
-            letters.
+        orientation: the orientation of the grid in space, which turns slices and adds coordinates and letters.
         z: (*shape,); values within the noise fade as in `scalar_image`.
         **kwargs: arguments of `scalar_image` for the whole volume, such as cmap, vmin, vmax, centre, quantiles.
 
     Raises:
-        ValueError: if there are not three axes, if the grid is not 3D, or if the values have another shape or none is
-            finite.
+        ValueError: if there are not three axes, if the grid is not 3D, or if values have another shape or are all NaN.
 
     Examples:
         >>> axes, grid = hj.plot.new_figure(6, 2).subplots(1, 3), hj.Grid((5, 5, 5))

@@ -51,8 +51,7 @@ def biharmonic_distance(pairs: Eigenpairs, sources: Any) -> Float[Array, "n_sour
         sources: node indices (n_sources, d), or (d,) for one source; vertex numbers on a mesh.
 
     Raises:
-        ValueError: if a source is outside the domain, if the domain has several components, or if no eigenvalue is
-            positive.
+        ValueError: if a source is outside the domain, if the domain is not connected, or if no eigenvalue is positive.
 
     Examples:
         >>> d = hj.biharmonic_distance(pairs, [(0, 0), (8, 8)])
@@ -133,12 +132,11 @@ def varadhan_distance(
 
     Args:
         pairs: the result of `eigenpairs`; more pairs resolve larger distances. Paths stay in the domain: they go around
-            holes of its mask and across periodic sides. Under ``"mirror"`` and ``"mean"`` straight sides have no
-            effect.
+            holes and across periodic sides. Under ``"mirror"`` and ``"mean"`` straight sides have no effect.
         times: (n_times,) positive, in (metric length)²; a time of about d·h suits the distance d.
         sources: node indices (n_sources, d), or (d,) for one source; vertex numbers (n_sources,) on a mesh.
-        normalised: whether to divide by the diagonal. Otherwise the result depends on the length unit and is NaN where
-            k_t > 1.
+        normalised: whether to divide by the diagonal. Otherwise the result depends on the unit, and is NaN where k_t >
+            1.
 
     Raises:
         ValueError: if times are invalid or if a source is out of range, outside the mask or at a Dirichlet node.
@@ -167,8 +165,7 @@ def varadhan_distance(
     _warn_of_distance(pairs, times, relative, by_pairs, by_grid)
     defined = relative > jnp.maximum(by_pairs, by_grid)
     if normalised:
-        # At distance zero the root has no derivative and the kernel may differ from 1 by rounding, so the result is set
-        # to 0.
+        # At distance zero the root has no derivative and the kernel may differ from 1 by rounding, so 0 is inserted.
         numbers = np.arange(space.domain.size).reshape(1, *space.node_shape)
         zero = (relative >= 1) | (numbers == _broadcast(nodes, space))[None]
     else:
@@ -185,8 +182,7 @@ def _broadcast(values: Any, space: FunctionSpace) -> Any:
 
 
 # By the Cauchy–Schwarz inequality the errors of the normalised kernel are about as large as the errors of its diagonal.
-# The errors of the diagonal are the truncated share of the trace, and the mean of the residuals weighted by the terms
-# of the trace.
+# The errors of the diagonal are the truncated share of the trace, and the residuals weighted by the terms of the trace.
 #
 # Linear elements have the eigenvalue ξ² (1 + ξ²h²/12) and the mass 1 − ξ²h²/6 at the frequency ξ along an axis. In the
 # kernel ∫ exp(iξd − tλ)/m dξ the means of powers of ξ are ⟨ξ²⟩ = (2t − d²)/4t² and ⟨ξ⁴⟩ = (d⁴ − 12td² + 12t²)/16t⁴. To
@@ -205,8 +201,7 @@ def _least_kernels(
     residuals = jnp.sum(weights * jnp.where(pairs.kept, pairs.residuals, 0)[None], axis=1) / jnp.sum(weights, axis=1)
     error = MARGIN * truncation(pairs, times).tail + residuals + 100 * jnp.finfo(times.dtype).eps
     at_nodes = jnp.where(space.free, jnp.square(resolution.mesh_width), 0)
-    # The spacing along the geodesic is not known. The spacing at the ends of the geodesic or, if larger, the mean
-    # spacing replaces it.
+    # The spacing along the geodesic is not known. The spacing at its ends or, if larger, the mean spacing is used.
     along = jnp.maximum(
         jnp.maximum(at_nodes[None], _broadcast(at_nodes.ravel()[nodes], space)), jnp.sum(at_nodes) / space.n_dof
     )

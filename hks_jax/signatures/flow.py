@@ -27,9 +27,8 @@ def heat_flow(pairs: Eigenpairs, times: Any, functions: Any) -> Float[Array, "n_
     tensors. The result is NaN outside the mask, and 0 at Dirichlet nodes.
 
     Args:
-        pairs: the result of `eigenpairs`. The boundary conditions of the pairs also hold for u. Values of u at
-            Dirichlet nodes are not used. ``"mirror"`` and ``"mean"`` extend u evenly, which gives the same flow as
-            ``"neumann"``.
+        pairs: the result of `eigenpairs`. The boundary conditions of the pairs also hold for u. Values at Dirichlet
+            nodes are not used. ``"mirror"`` and ``"mean"`` extend u evenly, which gives the same flow as ``"neumann"``.
         times: (n_times,) positive, in (metric length)².
         functions: (*shape), or (…, *shape) for several functions; values outside the mask are not used.
 
@@ -119,8 +118,7 @@ def gaussian_scale_space(
     """Blur functions by an isotropic Gaussian, whose constant width is the mean width to which heat spreads.
 
     In coordinates the standard deviation is √(2t/s), where s is the mean of |T|^(1/d) over the domain. Division by the
-    blurred mask and reflection at the sides of the grid preserve constant functions. The result is NaN outside the
-    mask.
+    blurred mask and reflection at the grid's sides preserve constants. The result is NaN outside the mask.
 
     Args:
         field: the metric, for its scale, its grid and its mask.

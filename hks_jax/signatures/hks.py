@@ -43,12 +43,9 @@ class AutomaticHKS(eqx.Module):
         times: (n_times,).
         spectral: (n_times,) bool, true at times computed from eigenpairs, false at spectrum-free times.
         tail: (n_times,) the estimated share beyond the eigenpairs (`truncation`), by which the method was chosen.
-        method: the method of the spectrum-free times: ``"colouring"`` or ``"selected-inversion"``; ``"none"`` if there
-            are no such times.
-        overlap_time: the shortest time computed from eigenpairs, at which the methods are compared; NaN if there is
-            none.
-        overlap_difference: the greatest difference of the two methods at that time, relative to (4πt)^(−d/2); NaN if
-            they were not compared.
+        method: the method at spectrum-free times: ``"colouring"`` or ``"selected-inversion"``; ``"none"`` without them.
+        overlap_time: the shortest time computed from eigenpairs, at which the methods are compared, or NaN.
+        overlap_difference: the greatest difference at that time, relative to (4πt)^(−d/2); NaN if not compared.
     """
 
     values: Float[Array, "n_times *shape"]

@@ -32,10 +32,9 @@ class LogDeterminant(NamedTuple):
 
     Attributes:
         value: log det′ Δ.
-        error: an estimate of the discretisation error and of omitted terms of the heat trace; derivatives treat it as a
-            constant.
+        error: an estimate of the discretisation error and of omitted terms of the heat trace; constant in derivatives.
         time: the time T up to which the heat trace is computed from its coefficients, and after which from eigenvalues;
-            derivatives treat it as a constant.
+            constant in derivatives.
     """
 
     value: Float[Array, ""]
@@ -52,12 +51,10 @@ def heat_coefficients(
 ) -> Float[Array, " 3"]:
     """Return a₀, a₁, a₂ of the heat trace Σ exp(−λᵢt) ~ a₀/t + a₁/√t + a₂ of a surface (Kac 1966; McKean, Singer 1967).
 
-    The coefficients are a₀ = V/4π, a₁ = ±L/8√π (+ for Neumann conditions) and a₂ = χ/6 + Σ (π − θ)²/24πθ over the
-    corners.
+    These are a₀ = V/4π, a₁ = ±L/8√π (+ for Neumann conditions) and a₂ = χ/6 + Σ (π − θ)²/24πθ over the corners.
 
     Args:
-        pairs: the result of `eigenpairs` in 2D. V is the area; under "mirror" and "mean" it is the area of the doubled
-            domain.
+        pairs: the result of `eigenpairs` in 2D. V is the area, under "mirror" and "mean" of the doubled domain.
         euler_characteristic: χ, which is 2 for a sphere, 0 for a torus, and 1 for a disc or a square.
         boundary_length: L, in the units of the metric.
         corners: the inner angles θ of the boundary's corners, in radians; for a square, four times π/2.
@@ -100,10 +97,9 @@ def log_determinant(
 ) -> LogDeterminant:
     """Compute log det′ Δ = −ζ′(0), where ζ(s) = Σ λᵢ^(−s) is the sum over the positive eigenvalues.
 
-    The heat trace's expansion at small times accounts for the eigenvalues that were not computed. The result is
-    differentiable with respect to the eigenvalues and the coefficients. Errors of the eigenvalues limit the accuracy:
-    for linear elements with spacing h in 2D the error is about a₀h²/16T². So a small T requires many pairs and a fine
-    grid.
+    The heat trace's expansion at small times accounts for the remaining eigenvalues. The result is differentiable with
+    respect to the eigenvalues and the coefficients. Errors of the eigenvalues limit the accuracy: for linear elements
+    with spacing h in 2D the error is about a₀h²/16T². So a small T requires many pairs and a fine grid.
 
     Args:
         pairs: the lowest eigenpairs, from `eigenpairs`.

@@ -41,8 +41,7 @@ def region_statistics(values: Any, labels: Any, node_volume: float = 1.0) -> Reg
         node_volume: the volume (in 2D, the area) of one node.
 
     Returns:
-        Statistics with one entry for each nonzero label. A region without a node in the domain has coverage 0 and NaN
-        statistics.
+        One entry for each nonzero label. A region without a node in the domain has coverage 0 and NaN statistics.
 
     Raises:
         ValueError: if shapes disagree, if labels are not integers or all 0, or if the nodes with values depend on time.

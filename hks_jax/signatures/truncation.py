@@ -38,7 +38,7 @@ class Truncation(eqx.Module):
         resolution_bias: (n,) the relative discretisation error at the median node.
         lasting_bias: (n,) the part of this error that does not decrease with t, due to tensors that turn or stretch.
         coarse_fraction: (n,) the fraction of nodes where the discretisation error exceeds 10 %.
-        smallest_time: the least time at which `tail` is at most 1 %. The worst node then lacks up to 6 %, or up to 20 %
+        smallest_time: the least time at which `tail` is at most 1 %. The worst node then lacks up to 6 %, or 20 %
             beside a Dirichlet side.
         order: the power of 1/t with which the rest of the discretisation error decreases.
     """
@@ -289,8 +289,7 @@ def truncation_map(
 
     The result is an estimate, not a bound. On small grids the largest true share of a node was 0.25 to 2 times the
     largest estimate if the mean exceeded 0.1 %, and up to 3 times the estimate if the mean was 1e-6. The result is NaN
-    outside the mask, and 0 at Dirichlet nodes and if all pairs were computed. Derivatives treat the result as a
-    constant.
+    outside the mask, and 0 at Dirichlet nodes or with all pairs. Derivatives treat the result as a constant.
 
     Args:
         times: (n_times,) positive, in (metric length)².

@@ -39,8 +39,7 @@ class TensorNoise(eqx.Module):
         freedom: the degrees of freedom of the covariance if it was estimated; infinite if it was given.
 
     Raises:
-        ValueError: The covariance is not positive semidefinite, or has another shape; the correlation is positive, but
-            the noise has no grid.
+        ValueError: The covariance is not positive semidefinite, or has another shape; a correlation has no grid.
 
     Examples:
         >>> noise = hj.TensorNoise(np.tile(np.eye(3), (9, 9, 1, 1)))
@@ -141,8 +140,7 @@ class TensorNoise(eqx.Module):
         relative = np.einsum("na,nb->ab", parts[inside], parts[inside]) / (2 * inside.sum())
         if not np.trace(relative) > 0:
             raise ValueError("first, second: got equal tensors; expected different noise. Pass a second scan")
-        # The median of q is scaled to the median of χ², because a few nodes, as in fluid, have much more noise than
-        # most.
+        # The median of q is scaled to the median of χ², because a few nodes, as in fluid, have much more noise.
         q = np.einsum("na,ab,nb->n", parts[inside], np.linalg.pinv(2 * relative), parts[inside])
         relative *= np.median(q) / (2 * scipy.special.gammaincinv(len(relative) / 2, 0.5))
         # Smoothed white noise has the correlation exp(−h²/4w²) at the distance h.

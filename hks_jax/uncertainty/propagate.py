@@ -62,8 +62,8 @@ class _Moments(eqx.Module):
 # tetrahedron; each δ has the covariance Σ. Let y be the four maps at D + sδ. The δ add up to zero, so the mean of y
 # minus the value is of second order, and its expectation is s² times the bias. Up to second order, we have
 # y₁ + y₂ − y₃ − y₄ = 4sJη₁/√3; similar formulas give Jη₂ and Jη₃. Four maps thus give three samples, whereas two
-# antithetic pairs of maps give only two. The second-order variance belongs to a quadratic form of one δ; the mean over
-# four δ has a third of it.
+# antithetic pairs give only two. The second-order variance is that of a quadratic form of one δ; the mean of four has a
+# third.
 @jax.jit
 def _parts(maps: list[Any], value: Any) -> tuple[Any, Any]:
     """Return the samples Jη (3, …) of the noise of the value, and the even part, whose expectation is the bias."""
@@ -103,8 +103,8 @@ def uncertainty(
 
     Four samples δ of the noise with sum zero are drawn at a time, and maps of D + δ/2 are computed. The differences of
     the maps give three samples of the error of the value, and the mean of the maps gives the bias. The noise is halved,
-    because the measured tensors already contain noise. The relative error of a deviation is 29 % with 8 draws, and 8 %
-    with 100 draws.
+    because the measured tensors already contain noise. With 8 draws a deviation has the relative error 29 %, with 100 8
+    %.
 
     Args:
         function: maps tensors (*shape, d, d) to an array, or to a pytree of arrays. JAX must be able to trace the
@@ -120,14 +120,11 @@ def uncertainty(
         smoothing: the standard deviation, in coordinate units, of a Gaussian that smooths the tensors before the
             function is evaluated (see `smooth_tensors`); the noise must have a grid. 0 for no smoothing.
         seed: the seed of the random numbers.
-        compiled: whether to compile the function once for all draws. If false, the function is called directly, without
-            tracing.
+        compiled: whether to compile the function once for all draws. Otherwise the function is called directly.
         progress: a function that is called with a short text after every four maps.
-        checkpoint: a file that is written after every four maps. If the file exists, resampling continues from its
-            state.
+        checkpoint: a file that is written after every four maps. If the file exists, resampling continues.
         each: a function that is called with each sample of the noise of the value, three times for four maps, for
-            example to compute covariances or errors of means. The function is not called for the samples of a
-            checkpoint.
+            example to compute covariances or errors of means. It is not called for samples of a checkpoint.
 
     Returns:
         The value with its standard deviation, its bias and their accuracy. Under `jit`, `method` must not be
@@ -138,8 +135,7 @@ def uncertainty(
             belongs to another computation.
 
     Warns:
-        AccuracyWarning: if no intervals are claimed, because noise makes tensors indefinite or its effect is not
-            linear.
+        AccuracyWarning: if no intervals are claimed, because noise makes tensors indefinite or acts nonlinearly.
 
     Examples:
         >>> noise = hj.TensorNoise.relative(field.tensors, 0.1)
