@@ -44,7 +44,7 @@ class AutomaticHKS(eqx.Module):
         spectral: (n_times,) bool, true at times computed from eigenpairs, false at spectrum-free times.
         tail: (n_times,) the estimated share beyond the eigenpairs (`truncation`), by which the method was chosen.
         method: the method at spectrum-free times: ``"colouring"`` or ``"selected-inversion"``; ``"none"`` without them.
-        overlap_time: the shortest time computed from eigenpairs, at which the methods are compared, or NaN.
+        overlap_time: the shortest time computed from eigenpairs, if the methods were compared there; otherwise NaN.
         overlap_difference: the greatest difference at that time, relative to (4πt)^(−d/2); NaN if not compared.
     """
 
@@ -65,7 +65,7 @@ class AutomaticHKS(eqx.Module):
             if some:
                 listed = ", ".join(some[:8]) + (" …" if len(some) > 8 else "")
                 lines.append(f"{len(some)} of {times.size} times by {name}: {listed}")
-        if math.isfinite(float(self.overlap_difference)):
+        if math.isfinite(float(self.overlap_time)):
             lines.append(
                 f"at t = {float(self.overlap_time):.4g} the two methods differ by {float(self.overlap_difference):.1e}"
             )
@@ -177,6 +177,7 @@ def hks_auto(
         overlap = jnp.min(known_times[large])
         least = work(settings, pencil, times[small])
         difference = _difference(known_pairs, overlap[None], tolerance, _DEARER * least)
+        overlap = jnp.where(jnp.isnan(difference), nan, overlap)
         if float(difference) > 10 * tolerance:
             warn_of_accuracy(
                 f"at t = {float(overlap):.4g} the signatures with and without eigenpairs differ by "

@@ -103,8 +103,8 @@ def uncertainty(
 
     Four samples δ of the noise with sum zero are drawn at a time, and maps of D + δ/2 are computed. The differences of
     the maps give three samples of the error of the value, and the mean of the maps gives the bias. The noise is halved,
-    because the measured tensors already contain noise. With 8 draws a deviation has the relative error 29 %, with 100 8
-    %.
+    because the measured tensors already contain noise. The relative error of a deviation is 29 % with 8 draws, and 8 %
+    with 100 draws.
 
     Args:
         function: maps tensors (*shape, d, d) to an array, or to a pytree of arrays. JAX must be able to trace the
