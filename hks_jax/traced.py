@@ -12,5 +12,5 @@ def is_traced(tree: Any) -> bool:
 
 
 def is_staged() -> bool:
-    """Return whether every operation is staged for a later computation, so that it returns a tracer."""
+    """Return whether JAX stages every operation, as under `jax.jit`, so that even constants give tracers."""
     return is_traced(jnp.zeros(()))

@@ -23,7 +23,7 @@ from hks_jax.linear.pencil import P, SymmetricPencil
 RawPairs = tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, ""]]
 
 Report = Callable[[str], Any]
-"""A function that receives short texts on the progress of a computation. Some of these are a `Status`."""
+"""A function that receives short texts on the progress of a computation. Some texts are of the class `Status`."""
 
 
 class Status(str):
@@ -51,10 +51,10 @@ class Eigensolver(eqx.Module, Generic[P]):
 
     Attributes:
         name: the name of the method in reports.
-        indefinite: whether it supports an indefinite stiffness, or one with an unknown null space.
+        indefinite: whether the method supports a stiffness that is indefinite, or whose null space is unknown.
         adjoint: the linear solver for derivatives. The default supports every pencil that can be factorised.
         tolerance: the relative residual ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁) at which a pair counts as converged. If the
-            level of rounding is larger, it replaces the tolerance.
+            level of rounding is larger, it is used instead.
     """
 
     name: ClassVar[str]

@@ -80,7 +80,7 @@ def test_all_in_an_interval(problem, solver):
     told = []
     pairs = hj.eigsh(K, M, interval=tuple(ends), solver=solver, progress=told.append)
     check(pairs, K, M, spectrum[first + 1 : last + 1])
-    assert solver is None or "eigenpairs, all below" in told[-1]
+    assert solver is None or "eigenpairs, and all eigenvalues below" in told[-1]
 
 
 def test_an_interval_without_eigenvalues():

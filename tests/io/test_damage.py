@@ -203,7 +203,7 @@ def test_members_that_a_damaged_list_hides(tmp_path):
     content[entries[0] + 32] = (
         content.index(b"PK\x05\x06") - entries[1]
     )  # the length of the first entry's comment: the next entry
-    with pytest.raises(ValueError, match=r"its end states 2 members, but it lists 1"):
+    with pytest.raises(ValueError, match=r"its end record states 2 members, but its list has 1"):
         load_npz(_written(tmp_path / "a.npz", content))
 
 

@@ -31,7 +31,7 @@ class Band(NamedTuple):
         """
         below = jnp.maximum(self.low - value, 0)
         degree = jnp.arccosh(jnp.asarray(gain, value.dtype)) / jnp.arccosh(1 + 2 * below / (self.high - self.low))
-        return jnp.fmin(degree, MOST_DEGREE)  # also if the degree is NaN, because the band is empty
+        return jnp.fmin(degree, MOST_DEGREE)  # the degree is NaN if the band is empty
 
 
 # Let x be an approximate eigenvector with Rayleigh quotient λ and residual r = Kx − λMx. Let p be the Chebyshev
@@ -85,7 +85,7 @@ def correction(
         w = inverse(residual / pencil.lumped[..., None].astype(dtype)) - aligned(reference.astype(dtype), whole) * whole
         return chebyshev_iteration(lambda z: inverse(stiffness(z)), w, band.low, band.high, reference, degree)
 
-    # The cases are separate, so that XLA fuses a whole step if there are no further terms.
+    # The two cases are separate, so that XLA fuses a whole step if there are no further terms.
     return jax.lax.cond(jnp.asarray(terms) > 0, lambda: run(further), lambda: run(lambda y: y))
 
 
@@ -94,5 +94,5 @@ def upper_end(pencil: NodalPencil) -> Float[Array, ""]:
     """Return an upper bound of the spectrum of D⁻¹K."""
     lumped, sums = pencil.lumped[..., None], pencil.lumped_or_zero[..., None]
     bound = lanczos_bound(pencil.stiffness.of_columns(), lambda r: r / lumped, sums, sums.size, _STEPS)
-    # The Gershgorin bound never fails, but is up to twice too large if tensors vary.
+    # Gershgorin's bound always holds, but may be twice too large if tensors vary.
     return jnp.minimum(bound, gershgorin(pencil.stiffness.coefficients, 1 / pencil.lumped))

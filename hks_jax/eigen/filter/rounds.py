@@ -22,15 +22,15 @@ from hks_jax.linear.accelerators import row_by_row
 from hks_jax.linear.loops import for_each
 
 _GAIN = 40.0
-"""The factor by which one round damps unwanted modes. At larger factors the lumped mass would limit the filter."""
+"""The factor by which one round damps unwanted modes. With more, the error by the lumped mass dominates."""
 _SPREAD = 1e5
 """The largest growth of the lowest mode relative to the edge of the band. Beyond it, rounding errors dominate."""
 _LEAST_DEGREE = 4
 _MARGIN = 1.1
 """The safety factor of Weyl's law for the eigenvalue of the last vector."""
 _SPLIT, _APART = 0.02, 1.5
-"""The limits beyond which the lumped mass gets further terms: the spread of the relative shifts of similar eigenvalues,
-and the least ψ, relative to the last wanted eigenvalue, of modes above twice that eigenvalue."""
+"""The limits beyond which the inverse mass gets further terms: on the spread of the relative shifts of similar
+eigenvalues, and on the least ψ of modes above twice the last wanted eigenvalue, relative to that eigenvalue."""
 _MOST_TERMS = 15
 """The maximal number of further terms of the Neumann series of the inverse mass."""
 
@@ -69,7 +69,7 @@ class Filtering(NamedTuple):
     band: Band  # the damped interval
     terms: Number  # the number of further terms in the inverse mass
     degrees: Int[Array, " blocks"]  # the degree for each block; 0 if all its vectors have converged
-    values: Values  # ψ of each vector; its polynomial is scaled to 1 there
+    values: Values  # ψ of each vector, at which its polynomial is scaled to 1
     factor: Values  # the factor of each vector's correction
 
 
@@ -185,7 +185,7 @@ class GridFilter(eqx.Module):
 
     @partial(jax.jit, donate_argnames="vectors")
     def filter_block(self, chosen: Filtering, values: Values, number: Number, own: Number, vectors: OwnRows) -> OwnRows:
-        """Filter one block of rows; `number` is its index among all blocks, and `own` its index among these rows."""
+        """Filter one block of rows: block `number` of all blocks, which is block `own` of this device."""
         pencil, block, products = self.pencil, self.plan.block, self.pencil.products()
         band, degree = chosen.band, chosen.degrees[number]
 
@@ -203,7 +203,7 @@ class GridFilter(eqx.Module):
             z = jnp.where(inside, 1, jnp.clip(scale, 0, 1)) * z.astype(x.dtype)
             return rows + row_by_row(to_rows(z))
 
-        # The condition gets only the block, because XLA copies the operands of a condition.
+        # `cond` gets only the block, because XLA copies the operands of a condition.
         rows = row_by_row(jax.lax.dynamic_slice_in_dim(vectors, own * block, block))
         rows = jax.lax.cond(degree > 0, filtered, lambda unchanged: unchanged, rows)
         return jax.lax.dynamic_update_slice_in_dim(vectors, rows, own * block, axis=0)
@@ -239,6 +239,6 @@ def _lumping(plan: Plan, state: FilterState) -> tuple[Number, Values, Values]:
 
 
 def _layout(slabs: Slabs | None) -> FilterState:
-    """Return the sharding of a state: vectors are in slabs, all else is on every device."""
+    """Return the sharding of a state: vectors are divided into slabs; every device has the other arrays."""
     vectors = EVERYWHERE if slabs is None else PartitionSpec(None, slabs.name)
     return FilterState(EVERYWHERE, vectors, EVERYWHERE, EVERYWHERE, EVERYWHERE, EVERYWHERE)  # type: ignore[arg-type]
