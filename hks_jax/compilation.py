@@ -156,11 +156,9 @@ class _Program(NamedTuple):
     numpy_rule: NumPyRule | None
 
     def __call__(self, *leaves: Any) -> Any:
-        """Evaluate the function."""
         return self.function(*self.args(*leaves))
 
     def args(self, *leaves: Any) -> list[Any]:
-        """Return the arguments of the function."""
         return [known if x is None else eqx.combine(known, x) for known, x in zip(*self.split(*leaves), strict=True)]
 
     def split(self, *leaves: Any) -> tuple[list[Any], list[Any]]:
@@ -197,7 +195,6 @@ class _LinearMap(NamedTuple):
         return list(leaves[:n]), list(leaves[n:])
 
     def __call__(self, *leaves: Any) -> list[Any]:
-        """Apply the map."""
         known, rest = self.split(leaves)
 
         def forward(*x: Any) -> list[Any]:

@@ -113,7 +113,7 @@ def heat_columns(
     top = gershgorin(stiffness, _inverse(lumped))
     if degree is None:
         if is_traced((top, times)):
-            raise ValueError("degree: got None with traced matrices or times; expected a number")
+            raise ValueError("degree: got None with traced matrices or times; expected an integer")
         if times.size and not float(jnp.min(times)) >= 0:
             raise ValueError(f"times: got {times}; expected nonnegative numbers")
         degree = least_degree(float(jnp.max(times, initial=0)) * float(top) / 2, tolerance)

@@ -62,22 +62,19 @@ def choose_for_fit(pencil: AnyPencil, k: int) -> Eigensolver:
 
 
 def _automatic(pencil: Pencil, k: int) -> Eigensolver:
-    ours: Eigensolver
     n, volume = pencil.space.n_dof, pencil.space.dimension == 3
     if n <= _SMALL or 4 * k > n:
         return Dense()
-    known = is_concrete_on_cpu(jax.lax.stop_gradient((pencil.stiffness, pencil.mass)))
-    if not (pencil.measured and pencil.bounded):
-        ours = BlockLanczos() if k < BlockLanczos().max_pairs(n) else Dense()
-        return ShiftInvert() if known and n * k < _LARGE else ours
-    exact = pencil.stiffness.dtype == np.float64
+    exact, laplacian = pencil.stiffness.dtype == np.float64, pencil.measured and pencil.bounded
     # In 3D factorisations have much fill-in, and in float32 they lose too many digits.
-    matrix_free = isinstance(pencil.stiffness, StencilOperator) and (volume or not exact)
-    ours = ChebyshevFilter() if matrix_free and k < ChebyshevFilter().max_pairs(n) else BlockLanczos()
-    if k >= ours.max_pairs(n):  # the driver computes one additional pair
-        ours = Dense()
-    if not known:
+    matrix_free = laplacian and isinstance(pencil.stiffness, StencilOperator) and (volume or not exact)
+    candidates = ([ChebyshevFilter()] if matrix_free else []) + [BlockLanczos()]
+    # The driver computes one additional pair.
+    ours = next((solver for solver in candidates if k < solver.max_pairs(n)), Dense())
+    if not is_concrete_on_cpu(jax.lax.stop_gradient((pencil.stiffness, pencil.mass))):
         return ours
+    if not laplacian:
+        return ShiftInvert() if n * k < _LARGE else ours
     # Shift-invert computes in float64, also for float32 matrices.
     suited = ChebyshevFilter if volume or not exact else BlockLanczos
     large = _LARGE if exact or volume else _LARGE_IN_SINGLE

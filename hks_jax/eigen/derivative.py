@@ -75,7 +75,7 @@ def _solved_jvp(
 ) -> tuple[tuple, tuple]:
     pencil, change = first_order_only(primals[0]), changes[0]
     n_dof, sides = pencil.size, 2 if interior else 1
-    spare = max(extra, min(sides * solver.guards(k, n_dof), min(solver.max_pairs(n_dof), n_dof) - k))
+    spare = max(extra, min(sides * solver.guards(k, n_dof), solver.max_pairs(n_dof) - k))
     values, vectors, complete_below = _computed(solver, pencil, k, spare, interior, report)
     adjoint = InteriorAdjoint(solver.adjoint.tolerance) if interior else solver.adjoint
     # The preparation does not depend on the change, so that all products with one Jacobian share it.
@@ -269,7 +269,7 @@ def _with_null_modes(xp: Any, mass: Any, nulls: Any, values: Any, vectors: Any) 
 
 @jax.custom_jvp
 def frame_of_chosen(vectors: Rows, mass: Operator, chosen: Bool[Array, " k"]) -> Rows:
-    """Return the vectors, but exclude from their derivative rotations of the chosen vectors among themselves.
+    """Return the vectors, with a derivative that excludes rotations of the chosen vectors among themselves.
 
     The result is a frame of the chosen vectors. A frame of all vectors would also exclude rotations towards vectors
     that are not chosen.

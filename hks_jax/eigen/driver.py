@@ -130,11 +130,10 @@ def eigsh(
     pairs; then ``.result`` is not successful. For the largest eigenvalues, negate K; for interior eigenvalues, give the
     interval. A ``LinearOperator`` is not accepted, because K and M are factorised (by nested dissection).
 
-    First derivatives with respect to the entries of K and M are available in forward and reverse mode. Derivatives of
-    signatures are exact at eigenvalues of any multiplicity. So are derivatives of sums over all pairs of a multiple
-    eigenvalue. The derivative of an eigenvector is NaN if its eigenvalue is multiple; so do not sum f(λᵢ) φᵢ(x)²
-    yourself, but use `spectral_signature`. The function works under `jit`, and under `vmap` over pencils from
-    `sparse_pencil` that share a sparsity pattern. Derivatives in an interval keep its ends fixed.
+    Derivatives with respect to the entries of K and M are those of `eigenpairs`. The derivative of an eigenvector is
+    NaN if its eigenvalue is multiple; so do not sum f(λᵢ) φᵢ(x)² yourself, but use `spectral_signature`. The function
+    works under `jit`, and under `vmap` over pencils from `sparse_pencil` that share a sparsity pattern. Derivatives in
+    an interval keep its ends fixed.
 
     Args:
         K: a symmetric (n, n) matrix: a SciPy sparse matrix, a BCOO or BCSR of `jax.experimental.sparse`, an operator of

@@ -152,13 +152,6 @@ class Eigenpairs(eqx.Module):
         return int((values == 0).sum())
 
     @property
-    def last_eigenvalue(self) -> Float[Array, ""]:
-        """The largest kept eigenvalue; NaN if there are no pairs."""
-        if not self.k:
-            return jnp.asarray(np.nan, self.eigenvalues.dtype)
-        return _last(self.eigenvalues, self.kept)
-
-    @property
     def cut_multiplet(self) -> Array:
         """The number of kept pairs that belong to a multiple eigenvalue cut by the truncation; 0 if it cuts none."""
         known = self.eigenvalues, self.kept, self.next_eigenvalue, self.spectral_origin, self.multiplet_tolerance
@@ -228,7 +221,7 @@ class Eigenpairs(eqx.Module):
             return "no eigenpairs: the interval contains no eigenvalue"
         values, residuals = np.asarray(self.eigenvalues), np.asarray(self.residuals)
         kept, following = int(np.asarray(self.kept).sum()), float(self.next_eigenvalue)
-        last = float(self.last_eigenvalue)
+        last = values[kept - 1]
         lines = [
             f"{self.k} eigenpairs of {sum(p.space.n_dof for p in self.pencil.parts)} by {self.solver_name}",
             f"eigenvalues {values[0]:.6g} … {last:.6g} ({self.n_null} zero; the next is {following:.6g})",
@@ -260,11 +253,6 @@ def multiplet_gap(xp: Any, values: Any, origin: Any, tolerance: Any) -> Any:
     """Return the largest gap between each eigenvalue and the next at which the two count as equal, (*k)."""
     finfo = jnp.finfo(values.dtype)
     return tolerance * xp.maximum(xp.maximum(values - origin, finfo.eps * xp.abs(values)), finfo.tiny)
-
-
-@numpy_where_known()
-def _last(xp: Any, values: Any, kept: Any) -> Any:
-    return values[xp.sum(kept) - 1]
 
 
 @numpy_where_known(static_argnums=5)

@@ -30,7 +30,7 @@ class Status(str):
     """A text on the progress of a computation, with an estimate of the remaining time.
 
     Attributes:
-        seconds_left: the estimate; None if there is none.
+        seconds_left: the estimate; None if it is unknown.
     """
 
     seconds_left: float | None
@@ -125,7 +125,7 @@ def _on_host(
         factor = cholesky(mass, lower=True)
         half = solve_triangular(factor, stiffness, lower=True)
         reduced = solve_triangular(factor, half.T, lower=True)
-        few = 3 * k < n  # then bisection and relatively robust representations are faster
+        few = 3 * k < n  # for few pairs, LAPACK's driver `evr` is faster
         values, modes = eigh(reduced, subset_by_index=[0, k - 1]) if few else eigh(reduced, driver="evd")
         vectors = solve_triangular(factor, modes[:, :k], lower=True, trans="T")
     except (np.linalg.LinAlgError, ValueError):

@@ -50,7 +50,8 @@ _ROWS = 128
 class Adjoint(eqx.Module, Generic[P]):
     """A linear solver with K − λᵢM on the complement of the computed eigenvectors; all settings are static.
 
-    Every eigensolver has a default in its field ``adjoint``; any other that supports the pencil may replace it.
+    Every eigensolver has a default in its field ``adjoint``; any other `Adjoint` that supports the pencil may replace
+    it.
 
     Attributes:
         tolerance: the error in the energy norm, relative to the largest row. Rounding errors of eigenvectors bound it
@@ -82,7 +83,7 @@ def attainable(tolerance: float, dtype: Any) -> float:
 def definite_product(
     stiffness: Callable[[Array], Array], mass: Callable[[Array], Array], shifts: Float[Array, " b"], beyond: Scalar
 ) -> Callable[[Columns], tuple[Columns, Float[Array, " b"]]]:
-    """Return x ↦ (K − λᵢM) xᵢ, and the energy below which K − λᵢM counts as singular on the complement."""
+    """Return a function that maps xᵢ to (K − λᵢM) xᵢ and to the energy below which K − λᵢM counts as singular."""
 
     def product(x: Columns) -> tuple[Columns, Float[Array, " b"]]:
         image = mass(x)

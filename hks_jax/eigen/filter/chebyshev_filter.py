@@ -37,7 +37,7 @@ _SPARE = 0.35
 _LEAST_NODES = 6
 """The least number of nodes along each axis at which a grid is coarsened."""
 _LARGE = 1 << 21
-"""The total size of the vectors above which a round is so long that progress is reported after each block."""
+"""The total number of entries of the vectors above which progress is reported after each block, not only each round."""
 
 Pairs = tuple[Float[Array, " k"], Float[Array, "k n_dof"]]
 
@@ -128,23 +128,27 @@ _compiled = jax.jit(_lowest, static_argnames=("plan", "max_rounds", "report"))
 
 def _converge(grid: GridFilter, rounding: Array, state: FilterState, max_rounds: int, report: Report) -> FilterState:
     """Return the state after the rounds on the finest grid. Report each round and, for large problems, each block."""
+    wanted = grid.plan.wanted
+
+    def excess(state: FilterState) -> Float[Array, " wanted"]:
+        return grid.excess(rounding, state)[:wanted]
 
     def going_on(state: FilterState) -> Bool[Array, ""]:
-        return (grid.unconverged(rounding, state) > 0) & (state.rounds < max_rounds)
+        return jnp.any(~(excess(state) <= 1)) & (state.rounds < max_rounds)
 
     if report is silent or is_traced(state):
         return while_loop(going_on, partial(grid.improve, rounding), state)
-    wanted, pace = grid.plan.wanted, Pace(float(grid.excess(rounding, state)))
+    pace = Pace(float(jnp.max(excess(state))))
     in_steps = grid.plan.mesh is None and state.vectors.size >= _LARGE
     while going_on(state):
-        text = f"{wanted - int(grid.unconverged(rounding, state))} of {wanted} pairs, round {int(state.rounds) + 1}"
+        text = f"{int(jnp.sum(excess(state) <= 1))} of {wanted} pairs, round {int(state.rounds) + 1}"
         report(Status(text, pace.seconds_left()))
 
         def tell(done: int, of: int, text: str = text) -> None:
             report(Status(f"{text}: {done / of:.0%} of the products", pace.seconds_left(done, of)))
 
         state = grid.improve_told(rounding, state, tell) if in_steps else grid.improve(rounding, state)
-        pace.round_done(float(grid.excess(rounding, state)))
+        pace.round_done(float(jnp.max(excess(state))))
     return state
 
 

@@ -29,8 +29,8 @@ def coarsen(fine: NodalPencil) -> NodalPencil:
     axes = [axis_colours(n, 3, wraps) for n, wraps in zip(shape, fine.periodic, strict=True)]
     counts = [int(axis.max()) + 1 for axis in axes]
     padded = -(-math.prod(counts) // _COLUMNS) * _COLUMNS
-    # Neighbours have different colours; the colour of a neighbour that does not exist is −1. The only constants of the
-    # program are arrays along axes. The barrier prevents constant folding.
+    # Neighbours have different colours; the colour of a neighbour that does not exist is −1. Only arrays along single
+    # axes are constants of the program, and the barriers keep XLA from folding constants.
     colours = jnp.zeros((), jnp.float32)
     along = jax.lax.optimization_barrier([jnp.asarray(axis, jnp.float32) for axis in axes])
     for axis, (own, count) in enumerate(zip(along, counts, strict=True)):

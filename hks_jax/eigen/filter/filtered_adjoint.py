@@ -61,7 +61,7 @@ class FilteredAdjoint(Adjoint[Pencil]):
         """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`."""
         space, nodal, high = pencil.space, nodal_pencil(pencil), prepared
         tolerance, beyond = complement.attainable(self.tolerance, rhs.dtype), complement.first_beyond(values)
-        # The polynomial acts on D⁻¹K, whose values for φ are φᵀKφ / φᵀDφ. On coarse grids these are a fraction of λ.
+        # The polynomial acts on D⁻¹K, whose Rayleigh quotient for φ is φᵀKφ / φᵀDφ: on coarse grids, a fraction of λ.
         mass = space.restrict(nodal.lumped)
         quotients = values / jax.lax.map(lambda phi: jnp.sum(mass * phi * phi), vectors, batch_size=self.block)
         band = Band(jnp.minimum(jnp.max(quotients) * (1 + 1 / values.size), _WIDEST * high), high)

@@ -25,7 +25,7 @@ class Band(NamedTuple):
     high: Float[Array, ""]
 
     def degree_for(self, value: Float[Array, "*b"], gain: float) -> Float[Array, "*b"]:
-        """Return the degree at which the polynomial equals ``gain`` at a value below the band: gain = cosh(degree · a).
+        """Return the degree at which the polynomial equals ``gain`` at a value below the band.
 
         The degree is at most `MOST_DEGREE`. If a wide band needs a higher degree, pairs do not converge.
         """
@@ -63,7 +63,7 @@ def correction(
     whole: Columns | float = 0.0,
     terms: Int[Array, ""] | int = 0,
 ) -> Columns:
-    """Return q(D⁻¹K) D⁻¹ residual, where q belongs to ζ = ``value``, which is at most the band's low end.
+    """Return q(D⁻¹K) D⁻¹r for the residual r and the polynomial q of ζ = ``value``, at most the band's low end.
 
     If n = ``terms`` > 0, W replaces D⁻¹, and value and band refer to WK. If a column x of ``whole`` is not zero, the
     residual's column must be Kx; then D⁻¹Kx − ζx replaces D⁻¹r, which amounts to p(D⁻¹K)/p(ζ) applied to x.

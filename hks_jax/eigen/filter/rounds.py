@@ -70,7 +70,7 @@ class Filtering(NamedTuple):
     terms: Number  # the number of further terms in the inverse mass
     degrees: Int[Array, " blocks"]  # the degree for each block; 0 if all its vectors have converged
     values: Values  # ψ of each vector, at which its polynomial is scaled to 1
-    factor: Values  # the factor of each vector's correction
+    factor: Values  # the factor by which each vector's correction is scaled
 
 
 class GridFilter(eqx.Module):
@@ -85,19 +85,11 @@ class GridFilter(eqx.Module):
         """The slabs into which the grid is divided between rounds; None on one device."""
         return self.pencil.cut(self.plan.mesh)
 
-    def allowed(self, rounding: Scalar, state: FilterState) -> Values:
-        """Return the largest residuals at which pairs count as converged."""
-        scale = jnp.maximum(state.values, state.values[self.plan.n_null])
-        return allowed_residuals(scale, rounding, self.plan.tolerance)
-
-    def unconverged(self, rounding: Scalar, state: FilterState) -> Number:
-        """Return the number of wanted pairs that have not converged."""
-        return jnp.sum(~(state.residuals <= self.allowed(rounding, state))[: self.plan.wanted])
-
     @jax.jit
-    def excess(self, rounding: Scalar, state: FilterState) -> Scalar:
-        """Return the largest ratio of a wanted pair's residual to its allowed residual."""
-        return jnp.max((state.residuals / self.allowed(rounding, state))[: self.plan.wanted])
+    def excess(self, rounding: Scalar, state: FilterState) -> Values:
+        """Return the residuals as multiples of the largest residuals that count as converged."""
+        scale = jnp.maximum(state.values, state.values[self.plan.n_null])
+        return state.residuals / allowed_residuals(scale, rounding, self.plan.tolerance)
 
     @jax.jit
     def from_random(self, volume: Scalar) -> FilterState:
@@ -139,10 +131,10 @@ class GridFilter(eqx.Module):
     def improve_told(
         self, rounding: Scalar | None, state: FilterState, done: Callable[[int, int], Any] | None = None
     ) -> FilterState:
-        """Filter the blocks that have not converged (all, if ``rounding`` is None), then apply Rayleigh–Ritz.
+        """Filter the blocks that have not converged (all blocks if ``rounding`` is None), then apply Rayleigh–Ritz.
 
-        Outside `jit` and on one device, the round can be interrupted between two blocks. After each block, ``done`` is
-        called with the numbers of finished and of all products. `improve` is the compiled version.
+        Outside `jit` and on one device, the round can be interrupted between two blocks. After each block, ``done``
+        receives the number of products so far and the number of all products. `improve` is the compiled version.
         """
         slabs, plan, layout = self.slabs, self.plan, _layout(self.slabs)
 
@@ -175,7 +167,7 @@ class GridFilter(eqx.Module):
         edge = _MARGIN * filtered_values[plan.wanted - 1] * (plan.size / plan.wanted) ** (2 / len(self.pencil.shape))
         low = jnp.minimum(jnp.minimum(jnp.max(filtered_values), edge), high / 2)
         band = Band(low, high)
-        left = spare | (True if rounding is None else ~(state.residuals <= self.allowed(rounding, state)))
+        left = spare | (True if rounding is None else ~(self.excess(rounding, state) <= 1))
         # The spare vectors need no higher degree than the last wanted vector.
         goal = jnp.where(spare, filtered_values[plan.wanted - 1], filtered_values)
         most = band.degree_for(jnp.zeros_like(low), _SPREAD)

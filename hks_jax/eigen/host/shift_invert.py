@@ -107,7 +107,7 @@ class ShiftInvert(Eigensolver[Pencil]):
                 of_each = (time.perf_counter() - factorised) / solves
                 # The final count of eigenvalues takes another factorisation.
                 left = to_come * of_each + factorised - begun
-                report(Status(f"{solves} solves of about {solves + to_come}", left))
+                report(Status(f"{solves} of about {solves + to_come} solves", left))
             y = factor.solve(x)
             return y - vectors @ (vectors.T @ (M @ y))
 

@@ -140,7 +140,7 @@ def _stepping(
             x = factor.solve(rhs)
             return x + factor.solve(residual_of(x))
 
-        # A loop compiles the solve only once.
+        # With a loop, the solve is compiled only once.
         def refine(done: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
             x, residual = state
             x = x + factor.solve(residual)

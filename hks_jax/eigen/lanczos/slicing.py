@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.lanczos.krylov_basis import Block, orthonormal
 from hks_jax.eigen.lanczos.recurrence import RitzPairs, ShiftedSolve, block_lanczos
-from hks_jax.eigen.lanczos.slicing_state import Plan, Problem, SlicingState, Stored, crowded, make_room, steps_for
+from hks_jax.eigen.lanczos.slicing_state import Plan, Problem, SlicingState, Stored, crowded, make_room
 from hks_jax.eigen.quality import allowed_residuals, indistinct, measure_pairs
 from hks_jax.linear import lapack
 from hks_jax.linear.dissection import Dissection
@@ -111,17 +111,17 @@ def search(
     """Find the eigenpairs around the shift."""
     state, vectors = both
     shifted = ShiftedSolve(factor, state.shift, state.passes)
-    if not is_traced(state.multiple) and state.multiple:
-        order, new, following = _nearest(problem, shifted, plan, state, vectors)
-    else:
+    one_multiplet = not is_traced(state.multiple) and bool(state.multiple)
+    if not one_multiplet:
         # If one slice suffices, usually no vector is known, and the window is empty. With several slices, an empty
         # first window would need a separate compilation.
         nothing = plan.wanted <= plan.slice_size and not is_traced(state.known) and int(state.known) == 0
         known, interval, steps = _window(problem, plan, state, vectors, 0 if nothing else plan.window)
         ritz = block_lanczos(problem.pencil, shifted, state.start, known, plan.steps, steps, plan.ritz)
         (order, following), new = _accept(problem, plan, ritz, interval, state), ritz[1]
-        if not is_traced(following.stuck) and following.stuck and state.below > 0:
-            order, new, following = _nearest(problem, shifted, plan, state, vectors)
+        one_multiplet = not is_traced(following.stuck) and bool(following.stuck and state.below > 0)
+    if one_multiplet:
+        order, new, following = _nearest(problem, shifted, plan, state, vectors)
     # This is a separate call, so that only two arrays of vectors are in memory at a time.
     return following, _stored(vectors, new, order, state.known)
 
@@ -182,7 +182,7 @@ def _window(
     left = jnp.maximum(plan.wanted - state.known, plan.slice_size // 4)
     # The last slice is smaller, but contains some unwanted eigenvalues, because the certificate needs a gap.
     size = jnp.where(left < plan.slice_size, left * 17 // 16 + 2 + 2 * plan.block, plan.slice_size)
-    return vectors, (low, high), jnp.minimum(steps_for(plan, size), plan.steps)
+    return vectors, (low, high), jnp.minimum(plan.steps_for(size), plan.steps)
 
 
 @jit_quickly(donate_argnames="known_vectors")
@@ -280,7 +280,7 @@ def _next_shift(problem: Problem, plan: Plan, state: SlicingState) -> Scalar:
     left = (plan.wanted - jnp.sum(ordered <= state.reached)).astype(ordered.dtype)
     slices = jnp.ceil(left / plan.slice_size)
     ahead = jnp.maximum(state.reached, state.complete_below) + spacing * (left / jnp.maximum(slices, 1) / 2 + 1)
-    # The widest of the next gaps is the safest place; the gap above the last known eigenvalue is estimated.
+    # The middle of the widest gap is the safest shift; the gap above the last known eigenvalue is estimated.
     gaps = jnp.where(index < known - 1, jnp.roll(ordered, -1) - ordered, spacing)
     last_few = (index >= plan.wanted - 1) & (index < plan.wanted + 7) & (index < known)
     widest = jnp.argmax(jnp.where(last_few, gaps, -1))
