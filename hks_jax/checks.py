@@ -2,6 +2,7 @@
 
 import math
 import operator
+from contextlib import suppress
 from typing import Any
 
 import jax
@@ -56,11 +57,9 @@ def real_array(name: str, values: Any) -> Array:
 
 def require_count(name: str, value: Any, least: int = 1) -> None:
     """Raise ValueError unless a setting is an integer of at least ``least``."""
-    try:
+    with suppress(TypeError):
         if operator.index(value) >= least:
             return
-    except TypeError:
-        pass
     raise ValueError(f"{name}: got {value!r}; expected an integer of at least {least}")
 
 

@@ -149,7 +149,7 @@ def eigsh(
         The pairs with residuals, convergence flags and the certificate. All signatures accept them.
 
     Raises:
-        ValueError: `sparse_pencil` or `eigenpairs` refuses an argument.
+        ValueError: `sparse_pencil` or `eigenpairs` does not accept an argument.
         RuntimeError: the computation failed and ``throw`` is set.
 
     Warns:

@@ -65,7 +65,7 @@ def count_eigenvalues(
 
     Raises:
         ValueError: σ is not finite, or too close to an eigenvalue (the message has the counts on both sides);
-            `eigenpairs` refuses the domain.
+            `eigenpairs` does not accept the domain.
 
     Examples:
         >>> print(hj.count_eigenvalues(field, 20.0), (pairs.eigenvalues < 20.0).sum())
@@ -76,7 +76,7 @@ def count_eigenvalues(
 
 
 def checked_pencil(domain: Any, boundary: BoundarySpec, mass: MassKind, quadrature: Quadrature = "gauss") -> AnyPencil:
-    """Return the pencil of a user's domain. Check that a concrete M of the user is positive definite."""
+    """Return the pencil of a user's domain. If the user's M is concrete, check that it is positive definite."""
     pencil = pencil_of(domain, boundary, mass, quadrature)
     for part in jax.lax.stop_gradient(pencil).parts:
         own = isinstance(part.space, MatrixSpace) or part.volume is None

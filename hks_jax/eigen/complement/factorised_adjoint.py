@@ -170,7 +170,7 @@ class InteriorAdjoint(FactorisedAdjoint):
     """
 
     def _distance(self, p: int, k: int, row: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-        """Return the odds for equidistant eigenvalues with equally many guards on both sides."""
+        """Return the odds of the rows, as if eigenvalues were equidistant with equally many guards on both sides."""
         others = (p - k) / 2
         return (k + others - row) / (row + others + 1)
 
@@ -197,7 +197,7 @@ class InteriorAdjoint(FactorisedAdjoint):
         def product(x: Columns) -> tuple[Columns, Float[Array, " b"]]:
             return factor.solve(stiffness(x) - shifts * mass(x)), complement.SINGULAR * inner(x, x)
 
-        # Rounding leaves components along computed eigenvectors. A amplifies only the components near σ.
+        # Rounding leaves components along computed eigenvectors. A amplifies only those whose eigenvalue is near σ.
         right = factor.solve(b)
         return conjugate_gradients(product, without_near, right, wanted, inner, without_known).converged
 

@@ -77,7 +77,7 @@ class SlicingState(NamedTuple):
     multiple: Bool[Array, ""]  # whether many eigenvalues are missing that are probably equal
     far: Float[Array, ""]  # the last shift at which too many eigenvalues were missing for a search
     far_below: Int[Array, ""]  # the number of eigenvalues below `far`; 0 at first
-    reached: Float[Array, ""]  # the end of the range from zero that seems to have no missing eigenvalue
+    reached: Float[Array, ""]  # the end of the range from zero in which no eigenvalue seems to be missing
     complete_below: Float[Array, ""]  # inertia certifies that every eigenvalue below this number is known
     start: Float[Array, "n_dof block"]  # the start block of the next Lanczos run
     noise: Float[Array, "n_dof block"]  # independent normal random numbers
