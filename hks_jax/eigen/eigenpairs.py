@@ -40,8 +40,8 @@ class Eigenpairs(eqx.Module):
     """The k lowest eigenpairs of Kφ = λMφ, or those in an interval; a pytree.
 
     The derivatives of signatures with respect to the matrices use `pencil` and `frame`, not `eigenvalues` and
-    `vectors`. So do not rescale these arrays: their replacements would be differentiable only with respect to
-    themselves. Rescale times or the pencil instead.
+    `vectors`. So do not rescale these arrays: derivatives of signatures would then refer to the new arrays, not to the
+    matrices. Rescale times or the pencil instead.
 
     Attributes:
         eigenvalues: (k,) in ascending order, in 1/(metric length)²; exactly 0 for null vectors.

@@ -32,7 +32,7 @@ BLOCK = 16
 WINDOW = 32
 """The number of eigenvectors nearest to a shift that every step projects out."""
 _GROWTH = 4e7
-"""A bound of the growth of rounding errors along computed eigenvectors; measured values are usually 1e4 to 1e5."""
+"""The largest factor by which solves amplify rounding errors along computed eigenvectors; 1e4 to 1e5 is usual."""
 _MEMORY = 5e8
 """The maximal total size of the factorisations in bytes."""
 

@@ -51,7 +51,7 @@ class FilteredAdjoint(Adjoint[Pencil]):
         require_count("block", self.block)
 
     def prepare(self, pencil: Pencil, values: Values, k: int) -> Scalar:
-        """Return an upper bound of the spectrum of D⁻¹K."""
+        """Return an upper bound of the spectrum of D⁻¹K, where D is the lumped mass."""
         if not isinstance(pencil.stiffness, StencilOperator):
             raise ValueError("adjoint: got FilteredAdjoint, which needs a grid; use FactorisedAdjoint for a mesh")
         return upper_end(nodal_pencil(pencil))

@@ -91,7 +91,7 @@ def correction(
 
 @jax.jit
 def upper_end(pencil: NodalPencil) -> Float[Array, ""]:
-    """Return an upper bound of the spectrum of D⁻¹K."""
+    """Return an upper bound of the spectrum of D⁻¹K, where D is the lumped mass."""
     lumped, sums = pencil.lumped[..., None], pencil.lumped_or_zero[..., None]
     bound = lanczos_bound(pencil.stiffness.of_columns(), lambda r: r / lumped, sums, sums.size, _STEPS)
     # Gershgorin's bound always holds, but may be twice too large if tensors vary.

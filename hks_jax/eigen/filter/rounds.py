@@ -77,7 +77,7 @@ class GridFilter(eqx.Module):
     """Subspace iteration on one grid. All grids of one shape share the compiled functions."""
 
     pencil: NodalPencil  # K and M
-    high: Scalar  # an upper bound of the spectrum of D⁻¹K
+    high: Scalar  # an upper bound of the spectrum of D⁻¹K, where D is the lumped mass
     plan: Plan = eqx.field(static=True)
 
     @property

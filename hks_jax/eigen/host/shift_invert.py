@@ -1,4 +1,4 @@
-"""Large sparse pencils by SciPy's shift-invert Lanczos on the host."""
+"""Eigenpairs of large sparse pencils by SciPy's shift-invert Lanczos, on the host."""
 
 import time
 from typing import ClassVar
@@ -161,7 +161,7 @@ def _padded(values: np.ndarray, vectors: np.ndarray, k: int, complete_below: flo
 
 
 def lower_bound(pencil: Pencil) -> Float[Array, ""]:
-    """Return a lower bound of the spectrum, which inertia confirms; NaN if the search fails."""
+    """Return a lower bound of the spectrum, confirmed by inertia; NaN if the search fails."""
     data, matrices = host_matrices(pencil)
     K, M = matrices(*data)
     typical = float(np.median(np.abs(K.diagonal()) / M.diagonal())) or 1.0

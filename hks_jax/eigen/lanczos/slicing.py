@@ -152,7 +152,7 @@ def _nearest(
 def _inverse_iteration(
     pencil: SymmetricPencil, shifted: ShiftedSolve, vectors: Stored, known: Int[Array, ""], x: Block
 ) -> tuple[Float[Array, " b"], Block, Float[Array, " b"]]:
-    """Return Ritz values, M-orthonormal Ritz vectors orthogonal to the known ones, and residuals."""
+    """Return Ritz values, M-orthonormal Ritz vectors orthogonal to the known vectors, and residuals."""
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
     x = shifted.factor.solve(mass(x))
     for _ in range(2):
