@@ -80,13 +80,18 @@ def indistinct(pencil: SymmetricPencil, dtype: np.dtype) -> Float[Array, ""]:
 
 
 def largest(pencil: SymmetricPencil) -> Float[Array, ""]:
-    """Estimate the largest eigenvalue by 4·max|Kᵢᵢ/Mᵢᵢ|, which is λ_max on a uniform grid in 2D and 3D."""
+    """Estimate the largest eigenvalue by 4·max|Kᵢᵢ/Mᵢᵢ|, which is λ_max on a uniform grid in 2D and 3D.
+
+    If the diagonal of K is small, as of an adjacency matrix, the estimate is the mean of Σⱼ|Kᵢⱼ|, divided by max Mᵢᵢ.
+    """
     return _largest(pencil.stiffness, pencil.mass)
 
 
 def largest_of(xp: Any, stiffness: Any, mass: Any) -> Any:
     """Return the result of `largest` for matrices of JAX or SciPy."""
-    return 4 * xp.max(xp.abs(stiffness.diagonal()) / mass.diagonal())
+    masses, entries = mass.diagonal(), stiffness.data if xp is np else stiffness.flat()
+    mean = xp.sum(xp.abs(entries)) / masses.size / xp.max(masses)
+    return xp.maximum(4 * xp.max(xp.abs(stiffness.diagonal()) / masses), mean)
 
 
 _largest = numpy_where_known()(largest_of)

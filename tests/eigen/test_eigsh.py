@@ -303,6 +303,16 @@ def test_a_vector_found_twice_has_not_converged(rng):
     np.testing.assert_array_equal(on_host[2], twice)
 
 
+def test_rounding_with_a_zero_diagonal(rng):
+    """The level of rounding follows from all entries, because the diagonal of an adjacency matrix is zero."""
+    links = np.triu(rng.random((60, 60)) < 0.2, 1)
+    assert hj.eigsh((links + links.T).astype(np.float32), k=5).converged.all()
+    star = np.zeros((10, 10))
+    star[0, 1:] = star[1:, 0] = 1
+    with pytest.raises(ValueError, match=r"1 eigenvalues are below \S+ and 9 are below"):
+        hj.count_eigenvalues(star, 0.0)
+
+
 @pytest.mark.slow
 def test_in_float32_none_is_missing_though_as_many_are_found():
     """Once two rows were equal, an eigenvalue missing, and the pairs certified."""
