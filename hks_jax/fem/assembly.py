@@ -55,9 +55,9 @@ def assemble(
             is node 0: an axis of n nodes has the period n·h), ``"mirror"`` (the domain is reflected on every side) or
             ``"mean"`` (two copies of the domain are glued along the whole rim). On grids give one name for all axes, or
             one entry per axis, which may be a pair (low, high) of ``"neumann"``, ``"dirichlet"`` and ``"mean"``. The
-            rim of a mask is natural, except under ``"mean"`` and ``"dirichlet-rim"``, which act on the rim and on all
-            sides. A further entry after those of the axes sets the condition on the rim: ``("periodic", "periodic",
-            "dirichlet")``. On meshes ``"neumann"``, ``"dirichlet"`` and ``"mean"`` act on the boundary.
+            condition on the rim of a mask is natural, except with ``"mean"`` and ``"dirichlet-rim"``, which act on the
+            rim and on all sides. A further entry after those of the axes sets the condition on the rim: ``("periodic",
+            "periodic", "dirichlet")``. On meshes ``"neumann"``, ``"dirichlet"`` and ``"mean"`` act on the boundary.
         mass: ``"consistent"``, ``"lumped"`` (the diagonal matrix of row sums), or your own form.
         potential: a field V of either sign; the operator becomes −Δ + V.
         density: a positive field ρ; the operator becomes −ρ⁻¹ div(ρ ∇·), in L² with the volume element ρ√|T| dx.
@@ -173,7 +173,7 @@ def _checked_operator(
         raise ValueError(f"stiffness: got {type(stiffness).__name__}; expected a form: a function of u, v and w")
     for name, form in (("stiffness", stiffness), ("mass", mass)):
         if is_traced([cell.cell_contents for cell in getattr(form, "__closure__", None) or ()]):
-            raise ValueError(f"{name}: the form closes over traced values; pass these, also numbers, as fields={{…}}")
+            raise ValueError(f"{name}: the form closes over traced arrays or numbers; pass all of them as fields={{…}}")
     require_count("components", components)
     own, given = stiffness is not None or callable(mass), dict(fields or {})
     named = {name: value for name, value in (("potential", potential), ("density", density)) if value is not None}

@@ -23,9 +23,10 @@ _WHOLE_RIM = {"mean": "mean", "dirichlet-rim": "dirichlet"}
 
 
 def normalise_boundary(boundary: BoundarySpec, dimension: int) -> tuple[Sides, ...]:
-    """Return the conditions (low, high) of every axis and, as last pair, twice the condition on the rim of a mask.
+    """Return a pair of conditions (low, high) for every axis, and a last pair with the condition on a mask's rim twice.
 
-    `assemble` describes the argument. By default the rim has the mean if an axis has it, and is natural otherwise.
+    `assemble` describes the argument. By default, the rim's condition is ``"mean"`` if an axis has it, and natural
+    otherwise.
     """
     if isinstance(boundary, str):
         everywhere = _WHOLE_RIM.get(boundary)
@@ -67,8 +68,8 @@ def _pair(entry: str | Sides) -> Sides:
 def default_boundary(inside: Bool[np.ndarray, "*shape"]) -> tuple[str, str]:
     """Return the boundary condition that suits a domain, and the reason.
 
-    It is the mean if the domain has a mask, since the natural condition on its rim would dominate the signature. The
-    command line uses it by default; the functions of the library use ``"neumann"``.
+    The condition is ``"mean"`` if the domain has a mask, since the natural condition on its rim would dominate
+    signatures. The command line uses it by default; the functions of the library use ``"neumann"``.
 
     Args:
         inside: (*shape) the nodes of the domain, such as `Grid.inside`.

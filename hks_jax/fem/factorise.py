@@ -31,9 +31,9 @@ def factorise(
 
     The matrix A may be indefinite. All results are differentiable with respect to K, M, σ and right-hand sides, in
     forward and reverse mode to any order, under `jit` and `vmap`. The elimination is a multifrontal LDLᵀ along a nested
-    dissection, without pivoting across fronts. Its accuracy is tested on random right-hand sides. If small pivots spoil
-    it, the elimination is repeated with these pivots replaced, and solutions are refined iteratively. If values are
-    traced, results of a singular matrix are NaN, and ``.sound`` is False.
+    dissection, without pivoting across fronts. Its accuracy is tested on random right-hand sides. If small pivots make
+    it inaccurate, the elimination is repeated with these pivots replaced, and solutions are refined iteratively. If
+    values are traced, results of a singular matrix are NaN, and ``.sound`` is False.
 
     Args:
         domain: a tensor field, a mesh, a pencil, a symmetric sparse matrix K (then M is the identity), or (K, M), as
@@ -185,7 +185,7 @@ class Multifrontal(lx.AbstractLinearSolver[_State]):
         return _State(factorised(_full(jnp.block([[real, -imaginary], below])), "operator"), hermitian)
 
     def compute(self, state: _State, vector: Any, options: dict[str, Any]) -> tuple[Any, lx.RESULTS, dict[str, Any]]:
-        """Solve with a factorised operator; for a singular operator it is NaN, which lineax reports as singular."""
+        """Solve with a factorised operator; if it is singular, the solution is NaN, and lineax reports this."""
         flat, unflatten = ravel_pytree(vector)
         return unflatten(state.solve(flat)), lx.RESULTS.successful, {}
 

@@ -173,7 +173,7 @@ class Slabs:
         if self.periodic[0]:
             up, down = [*up, (last, 0)], [*down, (0, last)]
             if planes + 1 < self.thickness:
-                # In the last slab that has nodes, padding follows them, and the plane above belongs right after them.
+                # In the last slab that has nodes, the plane above is placed right after the nodes, before the padding.
                 is_last = jax.lax.axis_index(self.name) == last
                 top = jnp.where(is_last, jax.lax.slice_in_dim(x, planes, planes + 1, axis=0), top)
                 place = jnp.where(is_last, planes + 2, place)

@@ -31,8 +31,8 @@ _ON_HOST = 1 << 17
 
 def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace, operator: WeakForm) -> Pencil:
     """Return the pencil of a field, or of one part of a doubled domain."""
-    # Masks, element and spacing are passed as arrays, so that problems that differ only in them share one compilation.
-    # The element is computed in double precision, since its rounding would scale the whole metric.
+    # Masks, element and spacing are passed as arrays, so that problems that differ only in these arrays share one
+    # compilation. The element is computed in double precision, since its rounding would scale the whole metric.
     tensors, spacing = field.tensors, field.grid.spacing
     element = tensor_product_element(space.dimension).stretched(spacing)
     gradients, weights, steps = (np.asarray(x, tensors.dtype) for x in (element.gradients, element.weights, spacing))
@@ -208,7 +208,7 @@ def _stencil(matrices: Float[Array, "*elements n n"], periodic: tuple[bool, ...]
         total = total + jnp.pad(couplings[a], [(1 - i, i) for i in node] + [(i, 1 - i) for i in node])
     total = total.reshape(3**d, *total.shape[d:])
     for axis, wraps in enumerate(periodic, start=1):
-        if wraps:  # the last node equals the first
+        if wraps:  # on a periodic axis, the last node is the first
             inner = jax.lax.slice_in_dim(total, 0, -1, axis=axis)
             last = jax.lax.slice_in_dim(total, -1, None, axis=axis)
             total = inner + jnp.pad(last, [(0, n - 1 if a == axis else 0) for a, n in enumerate(inner.shape)])
@@ -257,7 +257,7 @@ def assemble_mesh(
     space: MeshSpace,
     operator: WeakForm,
 ) -> Pencil:
-    """Return the pencil of a mesh; if it is ``curved``, its edges pass through their midpoints."""
+    """Return the pencil of a mesh; if it is ``curved``, its edges pass through the given midpoints."""
     element = simplex_element(space.dimension, space.degree)
     shape = len(space.cells), element.weights.size
     if curved:

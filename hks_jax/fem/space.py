@@ -96,7 +96,7 @@ class FunctionSpace(ByKey):
             return _reshaped(_spread(values, self._free_indices, fill), shape)
 
     def transfer(self, values: Float[Array, "... n_dof"], to: "FunctionSpace") -> Float[Array, "... n"]:
-        """Return functions of this space as functions of another one on the same nodes, zero at its Dirichlet nodes."""
+        """Return functions of this space as functions of another space on the same nodes, with its Dirichlet nodes."""
         return values if to == self else to.restrict(self.extend(values, outside=0.0))
 
 
@@ -158,7 +158,7 @@ class GridSpace(FunctionSpace):
         self.elements = active_elements(grid.inside, self.periodic)
         self.domain = element_nodes(self.elements, self.periodic)
         if not self.domain.any():
-            raise ValueError("mask: no element has all its nodes inside; use a thicker mask or a finer grid")
+            raise ValueError("mask: no element has all its nodes inside the mask; use a thicker mask or a finer grid")
         self.free = self.domain.copy()
         for axis, sides in enumerate(axes):
             for end, condition in zip((0, -1), sides, strict=True):
@@ -244,7 +244,7 @@ class MatrixSpace(FunctionSpace):
 
 
 def grid_space(grid: Grid, boundary: tuple[Sides, ...]) -> GridSpace:
-    """Return the space of a grid, which grids with the same nodes share."""
+    """Return the space of a grid; grids with the same nodes share one space."""
     return _unit_space(grid.unit, boundary)
 
 
@@ -269,7 +269,7 @@ def mask_for(values: Any, mask: Bool[np.ndarray, "*shape"]) -> Bool[np.ndarray |
 
 
 def couplings_for(values: Any, space: GridSpace) -> Bool[np.ndarray | Array, "offsets *shape"] | None:
-    """Mark the offsets and nodes of couplings with two free ends, for a computation with ``values``.
+    """Return, for each offset and node, whether both coupled nodes are free, for a computation with ``values``.
 
     The result is None if the values are traced and all nodes of the domain are free.
     """

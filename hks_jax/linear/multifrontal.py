@@ -34,25 +34,25 @@ Blocks = tuple[Array, ...]
 class Factorisation(eqx.Module):
     """K − σM = LDLᵀ.
 
-    Eliminating a front with own block A and coupling B to its boundary leaves the Schur complement C − BA⁻¹Bᵀ on the
-    boundary. A stack of factorisations, for several σ, has an additional leading axis.
+    A front has an own block A, a coupling B to its boundary, and a block C at the boundary. Its elimination leaves the
+    Schur complement C − BA⁻¹Bᵀ. A stack of factorisations, for several σ, has an additional leading axis.
     """
 
     dissection: Dissection  # the elimination tree
     # A⁻¹ stacked on BA⁻¹, (fronts, s + r, s), for each level of the (merged) tree
     downward: tuple[Float[Array, "... _fronts _s_plus_r _s"], ...]
     upward: tuple[Float[Array, "... _fronts _s _r"], ...]  # (BA⁻¹)ᵀ, (fronts, s, r)
-    # pivots: their product is the determinant, and as many are negative as eigenvalues of K − σM; padding has pivots 1
+    # pivots: their product is the determinant, and their signs give the inertia of K − σM; padding has pivots 1
     pivots: Float[Array, "... pivots"]
 
     @property
     def arrays(self) -> tuple[Blocks, Blocks, Array]:
-        """All arrays but the dissection, because XLA would copy the dissection if compiled functions returned it."""
+        """All arrays except the dissection, which XLA would copy if compiled functions returned it."""
         return self.downward, self.upward, self.pivots
 
     @property
     def negative(self) -> Int[Array, "..."]:
-        """The number of negative eigenvalues; by Sylvester's law of inertia, the number of the pencil's below σ."""
+        """The number of negative eigenvalues, which equals the number of the pencil's eigenvalues below σ."""
         return jnp.sum(self.pivots < 0, axis=-1)
 
     @jax.jit
@@ -148,7 +148,7 @@ def _eliminate(
 
 
 def _merged(levels: tuple[Level, ...], merged: Merged, downward: Blocks, upward: Blocks) -> tuple[Blocks, Blocks]:
-    """Return the matrices of merged levels, by substitution with the identity along the levels in each of them."""
+    """Return the matrices of merged levels, each by substitution of the identity along the tree levels in it."""
     inverses, couplings, first = [], [], 0
     for rows, places in zip(merged.rows, merged.places, strict=True):
         (fronts, s), group = places.shape, slice(first, first + len(rows))
@@ -200,7 +200,7 @@ def eliminate(
 def _substituted(
     levels: tuple[Level, ...], downward: Blocks, upward: Blocks, rhs: Float[Array, "n b"]
 ) -> tuple[Float[Array, "m b"], Float[Array, "fronts r b"]]:
-    """Solve along levels with x = 0 at the first one's boundary; return x at own nodes, and the boundary residual."""
+    """Solve along levels, with x = 0 at the boundary of the first; return x at own nodes, and the boundary residual."""
     width = rhs.shape[1]
     own: list[Array] = []
     passed: Array | None = None

@@ -83,7 +83,8 @@ class SparsePattern(Pattern):
 
     @cached_property
     def table(self) -> Ellpack:
-        """The pattern as a table. The width minimises the cost of products: a few long rows do not increase it."""
+        """The pattern as a table. Its width minimises the cost of products: a few long rows do not increase the
+        width."""
         counts = np.bincount(self.rows, minlength=self.size)
         start = np.cumsum(counts) - counts
         longer = np.cumsum(np.bincount(counts)[::-1])[::-1][1:]  # the number of rows with more than 0, 1, … entries

@@ -58,7 +58,7 @@ class SymmetricPencil(eqx.Module):
 
     @property
     def parts(self) -> tuple["SymmetricPencil", ...]:
-        """A tuple of the pencil itself, for symmetry with pencils of several parts."""
+        """The pencil itself, as the only problem."""
         return (self,)
 
     def shifted(self, shift: Float[Array, ""]) -> Float[Array, " m"]:

@@ -107,12 +107,12 @@ def row_blocks(
 
 
 def aligned(x: Array, like: ArrayLike) -> Array:
-    """Return x with leading axes up to the rank of ``like``, because `jax_numpy_rank_promotion` may be an error."""
+    """Return x with leading axes of length 1 up to the rank of ``like``, because a user may forbid rank promotion."""
     return jnp.expand_dims(x, tuple(range(jnp.ndim(like) - x.ndim)))
 
 
 _OF_MATRIX, _BLOCKS = 64, 8
-"""The least number of rows in a block of C, and the maximal number of blocks; each is compiled separately."""
+"""The least number of rows in a block of a matrix, and the maximal number of blocks; each is compiled separately."""
 _POINTS = 2048
 """The number of points per step, at which a few hundred vectors fit into the cache."""
 

@@ -21,17 +21,17 @@ swept in about ``_BLOCKS`` blocks."""
 _ROWS = 32
 """The largest size of blocks that are swept row by row."""
 _MANY = 128
-"""The least number of fronts of a level at which usually all are definite, because the shift is below their spectra."""
+"""If a level has at least this number of fronts, usually all are definite, because the shift is below their spectra."""
 _LARGEST, _SMALLEST = 64, 16
 """The largest number of rows of a kernel's matrix (4 warps with 32 numbers per thread), and the least after padding."""
 
 
 def symmetric_inverses(matrices: Matrices, least: Pivots | None = None) -> Inverses:
-    """Return the inverses and the pivots of each matrix: det A is their product, and their signs give the inertia.
+    """Return the inverse of each matrix A, and pivots, whose product is det A and whose signs give the inertia.
 
     Pivots smaller than ``least`` are replaced by ±``least``. Without ``least``, the inverse of a singular matrix is not
     finite. On CPUs, LAPACK computes Cholesky factors of large batches, which are usually definite, and eigenvalues of
-    others. Accelerators use elimination, because eigenvalues and Cholesky factors are slow there.
+    small ones. Accelerators use elimination, because eigenvalues and Cholesky factors are slow there.
     """
     none = jnp.zeros(len(matrices), matrices.dtype) if least is None else least
     if not accelerators.at_hand():  # avoids tracing unused branches
@@ -53,7 +53,7 @@ def _kernel_agrees(dtype: Any) -> bool:
 
 
 def by_cholesky_factors(matrices: Matrices, least: Pivots) -> Inverses:
-    """Invert by Cholesky factors, in a third of the time; by eigenvalues if a matrix is indefinite or a pivot small."""
+    """Invert by Cholesky factors, in a third of the time; by eigenvalues if a pivot is negative or small."""
     inverses = jax.vmap(lapack.inverse_cholesky)(matrices)
     pivots = jnp.diagonal(inverses, axis1=1, axis2=2) ** -2
     return jax.lax.cond(
@@ -64,7 +64,7 @@ def by_cholesky_factors(matrices: Matrices, least: Pivots) -> Inverses:
 
 
 def by_eigenvalues(matrices: Matrices, least: Pivots) -> Inverses:
-    """Invert small matrices by their eigenvalues, and others by sweeping blocks that are inverted likewise.
+    """Invert small matrices by their eigenvalues, and others by sweeping blocks, which the same function inverts.
 
     Large blocks are in turn swept in small blocks, which needs few passes over the matrix. The largest matrices are
     divided into halves, which takes fewer operations.

@@ -37,16 +37,16 @@ def hks_spectrum_free(
 ) -> Float[Array, "n_times *shape"]:
     """Compute the heat kernel signature without eigenpairs: the diagonal of exp(−tM⁻¹K)M⁻¹.
 
-    The result is that of all eigenpairs of the discretisation, at any t. The cost of colouring grows with t/h², whereas
-    the cost of eigenpairs falls; selected inversion costs the same at any t. docs/spectrum-free.md derives the bounds.
-    The unit is 1/(metric length)^d. Values are NaN outside the mask, 0 at Dirichlet nodes, and all NaN if a given
-    `Colouring` was made for a smaller largest eigenvalue, or for shorter times.
+    The result equals the signature of all eigenpairs of the discretisation, at any t. The cost of colouring grows with
+    t/h², whereas the cost of eigenpairs falls; selected inversion costs the same at any t. docs/spectrum-free.md
+    derives the bounds. The unit is 1/(metric length)^d. Values are NaN outside the mask, 0 at Dirichlet nodes, and all
+    NaN if a given `Colouring` was made for a smaller largest eigenvalue, or for shorter times.
 
     Args:
         domain: a tensor field on a grid, a mesh of triangles or tetrahedra, or a pencil of either from `assemble`.
         times: (n_times,) positive, in (metric length)².
         boundary: see `assemble`; a given pencil already contains it.
-        mass: the same. With colouring, ``"lumped"`` is 50 to 100 times as fast.
+        mass: see `assemble`. With colouring, ``"lumped"`` is 50 to 100 times as fast.
         method: ``"colouring"`` (on grids) applies Chebyshev polynomials to sums of distant point sources, with the same
             vectors for all times. ``"selected-inversion"`` uses a rational approximation with an error of about 1e-10.
             For n nodes each time takes O(n^1.5) operations in 2D, O(n²) in 3D, and memory for complex factors.

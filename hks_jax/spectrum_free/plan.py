@@ -29,7 +29,7 @@ _FASTER = 3.0
 _MEMORY = 8e9
 """The memory in bytes above which selected inversion is not chosen automatically."""
 _FILL = {2: 150, 3: 40}
-"""A lower bound, for n large, on the entries of factors over n^(2 − 2/d), the entries of a separator's block, by d."""
+"""Lower bounds, by dimension d, on the number of a factor's entries divided by n^(2 − 2/d), for large n."""
 
 
 def require_grid(pencil: AnyPencil) -> None:
@@ -49,8 +49,8 @@ def choose_method(pencil: AnyPencil, times: Float[Array, " m"], method: Method, 
         )
     if not all(part.bounded for part in pencil.parts):
         raise ValueError(
-            "domain: got a stiffness K with an unknown null space, which may be indefinite; expected K ⪰ 0. Pass the "
-            "null vectors to `sparse_pencil`, or use eigenpairs"
+            "domain: got a stiffness K that may be indefinite, since its null space is unknown; expected K ⪰ 0. Pass "
+            "the null vectors to `sparse_pencil`, or use eigenpairs"
         )
     if method == "selected-inversion" or (method == "auto" and pencil.space.dimension is None):
         return None
