@@ -129,12 +129,9 @@ def on_all_nodes(pencil: AnyPencil, k: int = 0) -> AnyPencil:
 
 def _of_one(pencil: Pencil) -> Pencil:
     space = pencil.space
-    known = not is_traced(jax.lax.stop_gradient(pencil.stiffness))
-    if not (
-        known
-        and isinstance(space, GridSpace)
-        and _FILLED[space.dimension] * space.free.size <= space.n_dof < space.free.size
-    ):
+    if is_traced(jax.lax.stop_gradient(pencil.stiffness)) or not isinstance(space, GridSpace):
+        return pencil
+    if not _FILLED[space.dimension] * space.free.size <= space.n_dof < space.free.size:
         return pencil
     natural = ("neumann", "neumann")
     sides = [("periodic", "periodic") if wraps else natural for wraps in space.periodic]

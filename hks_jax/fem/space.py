@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.arrays import ByKey
-from hks_jax.compilation import by_numpy, is_concrete_on_cpu
+from hks_jax.compilation import by_numpy, is_concrete_on_cpu, numpy_where_known
 from hks_jax.domain.components import active_elements, element_nodes, label_nodes, rim_nodes, wrap_nodes
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.triangulation import Triangulation
@@ -101,43 +101,26 @@ class FunctionSpace(ByKey):
 
 
 def _reshaped(values: Array, shape: tuple[int, ...]) -> Array:
-    return by_numpy(lambda known: known.reshape(shape), values) if _by_numpy(values) else jnp.reshape(values, shape)
+    if np.size(values) <= _COPIED and is_concrete_on_cpu(values):
+        return by_numpy(lambda known: known.reshape(shape), values)
+    return jnp.reshape(values, shape)
 
 
-def taken(values: Float[Array, "... n"], indices: Int[np.ndarray, " m"]) -> Float[Array, "... m"]:
-    """Return the values at given indices of the last axis."""
-    if _by_numpy(values):
-        return by_numpy(lambda known: np.take(known, indices, axis=-1), values)
-    return _taken(values, indices)
+# The indices are arguments, so that sets of equally many indices share one compilation.
+@numpy_where_known(most=_COPIED)
+def taken(xp: Any, values: Any, indices: Any) -> Any:
+    """Return the values (…, m) at given indices of the last axis."""
+    return xp.take(values, indices, axis=-1, mode="clip")
 
 
-def _spread(
-    values: Float[Array, "... m"], indices: Int[np.ndarray, " m"], fill: Float[np.ndarray, " n"]
-) -> Float[Array, "... n"]:
-    """Return an array with values at given indices of the last axis, and with ``fill`` elsewhere."""
-    if not _by_numpy(values):
-        return _spread_by_jax(values, indices, fill)
-    full = np.tile(fill, (*values.shape[:-1], 1))
+@numpy_where_known(most=_COPIED)
+def _spread(xp: Any, values: Any, indices: Any, fill: Any) -> Any:
+    """Return an array (…, n) with values at given indices of the last axis, and with ``fill`` (n,) elsewhere."""
+    full = xp.tile(fill, (*values.shape[:-1], 1))
+    if xp is jnp:
+        return full.at[..., indices].set(values, unique_indices=True, indices_are_sorted=True)
     full[..., indices] = values
-    return jax.device_put(full)
-
-
-def _by_numpy(values: Array) -> bool:
-    return np.size(values) <= _COPIED and is_concrete_on_cpu(values)
-
-
-# The indices are passed as arrays, so that sets of equally many indices share one compilation.
-@jax.jit
-def _taken(values: Float[Array, "... n"], indices: Int[np.ndarray | Array, " m"]) -> Float[Array, "... m"]:
-    return values[..., indices]
-
-
-@jax.jit
-def _spread_by_jax(
-    values: Float[Array, "... m"], indices: Int[np.ndarray | Array, " m"], fill: Float[np.ndarray | Array, " n"]
-) -> Float[Array, "... n"]:
-    full = jnp.broadcast_to(fill, (*values.shape[:-1], fill.size))
-    return full.at[..., indices].set(values, unique_indices=True, indices_are_sorted=True)
+    return full
 
 
 @jax.tree_util.register_static
@@ -149,7 +132,6 @@ class GridSpace(FunctionSpace):
 
     def __init__(self, grid: Grid, boundary: tuple[Sides, ...]) -> None:
         self._grid, self.boundary = grid.unit, boundary
-        self.inside = grid.inside
         self.node_shape, self.dimension = grid.shape, grid.dimension
         *axes, rim = boundary
         self.periodic = tuple(sides == ("periodic", "periodic") for sides in axes)

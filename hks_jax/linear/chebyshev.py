@@ -101,15 +101,14 @@ def chebyshev_heat_coefficients(
     return matmul(values, jnp.asarray(weights, times.dtype))
 
 
-def coefficient_sizes(z: float) -> Float[np.ndarray, " n"]:
-    """Return the absolute values of the Chebyshev coefficients of exp(−tλ), down to 1e-25, where z = t·top/2."""
-    n = np.arange(int(math.sqrt(2 * z * 60) + 60) + 1)
-    return np.where(n == 0, 1, 2) * scipy.special.ive(n, z)
-
-
 def coefficient_tails(z: float) -> Float[np.ndarray, " n_and_1"]:
-    """Return, for each n, the sum of the `coefficient_sizes` from n on, followed by 0."""
-    return np.append(np.cumsum(coefficient_sizes(z)[::-1])[::-1], 0)
+    """Return, for each n, the sum of the absolute Chebyshev coefficients of exp(−tλ) from n on, where z = t·top/2.
+
+    Coefficients below 1e-25 are omitted. The last sum is 0.
+    """
+    n = np.arange(int(math.sqrt(2 * z * 60) + 60) + 1)
+    sizes = np.where(n == 0, 1, 2) * scipy.special.ive(n, z)
+    return np.append(np.cumsum(sizes[::-1])[::-1], 0)
 
 
 def least_degree(z: float, error: float) -> int:

@@ -18,7 +18,7 @@ from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.multifrontal import Factorisation, Trial, eliminate, factorise, try_out
 from hks_jax.linear.operators import DiagonalOperator, OfColumns, PatternedOperator
 from hks_jax.linear.pencil import SymmetricPencil, tabulated
-from hks_jax.linear.selected_inversion import Eliminated, eliminated_differentiably, selected
+from hks_jax.linear.selected_inversion import Eliminated, inverse_entries, selected
 from hks_jax.linear.symmetric_inverse import symmetric_inverses
 from hks_jax.traced import is_traced
 
@@ -267,11 +267,8 @@ def _inverse(diagonal: bool, matrix: Float[Array, " m"], factor: Factorisation) 
 @_inverse.defjvp
 def _inverse_jvp(diagonal: bool, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     matrix, factor = primals
-
-    def of_matrix(matrix: Array) -> Array:
-        return selected(factor.dissection, eliminated_differentiably(factor.dissection, matrix), diagonal)
-
-    return _inverse(diagonal, matrix, factor), jax.jvp(of_matrix, (matrix,), tangents[:1])[1]
+    tangent = jax.jvp(lambda matrix: inverse_entries(factor.dissection, matrix, diagonal), (matrix,), tangents[:1])[1]
+    return _inverse(diagonal, matrix, factor), tangent
 
 
 @jax.custom_jvp

@@ -20,7 +20,7 @@ from hks_jax.compilation import jit_quickly
 from hks_jax.linear import lapack
 from hks_jax.linear.dissection import Dissection, Level, Merged
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import batched_with_columns, gram, matmul, transposed
+from hks_jax.linear.products import batched_with_columns, gram, matmul
 from hks_jax.linear.symmetric_inverse import symmetric_inverses
 
 CONTRACTION = 0.1
@@ -141,7 +141,7 @@ def _eliminate(
 
     levels = eliminate(dissection, matrix, inverted)
     downward = tuple(jnp.concatenate(level, axis=1) for level in levels)
-    upward = tuple(transposed(coupling) for _, coupling in levels)
+    upward = tuple(coupling.mT for _, coupling in levels)
     if dissection.merged is not None:
         downward, upward = _merged(dissection.levels, dissection.merged, downward, upward)
     return downward, upward, jnp.concatenate(pivots)
@@ -162,7 +162,7 @@ def _merged(levels: tuple[Level, ...], merged: Merged, downward: Blocks, upward:
         x, passed = _substituted(within, downward[group], upward[group], identity)
         inverse = x.at[places].get(mode="fill", fill_value=0, wrap_negative_indices=False)
         inverses.append(jnp.concatenate([inverse, -passed], axis=1))
-        couplings.append(-transposed(passed))
+        couplings.append(-passed.mT)
     return tuple(inverses), tuple(couplings)
 
 
@@ -192,7 +192,7 @@ def eliminate(
             blocks, beyond = blocks + added[:, :, :s], added[:, s:, s:]
         inverse = invert(blocks[:, :s], sizes)
         coupling = matmul(blocks[:, s:], inverse)
-        schur = beyond - matmul(coupling, transposed(blocks[:, s:]))
+        schur = beyond - matmul(coupling, blocks[:, s:].mT)
         eliminated.append((inverse, coupling))
     return eliminated[::-1]
 

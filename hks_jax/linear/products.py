@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Inexact, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.linear import accelerators
 from hks_jax.linear.linear_map import with_transpose
@@ -59,11 +59,6 @@ def batched_with_columns(matrices: Float[Array, "m i j"], columns: Float[Array, 
 
 def _written_out(matrices: Float[Array, "m i j"], columns: Float[Array, "m j b"]) -> Float[Array, "m i b"]:
     return reduce(add, (matrices[:, :, j : j + 1] * columns[:, j : j + 1] for j in range(matrices.shape[2])))
-
-
-def transposed(x: Inexact[Array, "m i j"]) -> Inexact[Array, "m j i"]:
-    """Return the transposes of a batch of matrices."""
-    return jnp.swapaxes(x, 1, 2)
 
 
 # The derivative with respect to parameters of the function sums over the rows. Written out row by row, the sum is
@@ -170,7 +165,7 @@ def quadratic_forms(
             return results
 
         none = [jnp.zeros((m, k - i, min(size, k - i)), vectors.dtype) for i in first]
-        return [transposed(block) for block in jax.lax.fori_loop(0, len(starts), add_points, none)]
+        return [block.mT for block in jax.lax.fori_loop(0, len(starts), add_points, none)]
 
     square = np.arange(k) // size == np.arange(k)[:, None] // size
     triangle = jnp.where(square, matrices, 2 * matrices)

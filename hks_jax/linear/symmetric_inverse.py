@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hks_jax.linear import accelerators, lapack
-from hks_jax.linear.products import even_size, matmul, transposed
+from hks_jax.linear.products import even_size, matmul
 
 Matrices = Float[Array, "m n n"]
 Pivots = Float[Array, " m"]
@@ -58,7 +58,7 @@ def by_cholesky_factors(matrices: Matrices, least: Pivots) -> Inverses:
     pivots = jnp.diagonal(inverses, axis1=1, axis2=2) ** -2
     return jax.lax.cond(
         jnp.all(pivots > least[:, None]),  # pivots are NaN if a matrix is not definite
-        lambda: (matmul(transposed(inverses), inverses), pivots),
+        lambda: (matmul(inverses.mT, inverses), pivots),
         lambda: by_eigenvalues(matrices, least),
     )
 
@@ -73,7 +73,7 @@ def by_eigenvalues(matrices: Matrices, least: Pivots) -> Inverses:
     if n <= _BLOCK:
         values, vectors = jax.vmap(lapack.eigh)(matrices)
         values = _away_from_zero(values, least[:, None])
-        return matmul(vectors / values[:, None, :], transposed(vectors)), values
+        return matmul(vectors / values[:, None, :], vectors.mT), values
     if n <= _LARGE:
         size = even_size(n, max(_BLOCK, n // _BLOCKS))
         return _by_blocks(by_eigenvalues, size, matrices, least)
@@ -81,10 +81,10 @@ def by_eigenvalues(matrices: Matrices, least: Pivots) -> Inverses:
     first, values = by_eigenvalues(matrices[:, :half, :half], least)
     coupling = matmul(matrices[:, half:, :half], first)
     schur = matrices[:, half:, half:] - matmul(coupling, matrices[:, :half, half:])
-    last, others = by_eigenvalues((schur + transposed(schur)) / 2, least)
+    last, others = by_eigenvalues((schur + schur.mT) / 2, least)
     beside = -matmul(last, coupling)
-    first = first - matmul(transposed(coupling), beside)
-    whole = jnp.block([[first, transposed(beside)], [beside, last]])
+    first = first - matmul(coupling.mT, beside)
+    whole = jnp.block([[first, beside.mT], [beside, last]])
     return whole, jnp.concatenate([values, others], axis=1)
 
 
@@ -138,7 +138,7 @@ def _swept(a: Matrices, rows: Float[Array, "m s n"], inverses: Float[Array, "m s
     index, own = jnp.arange(a.shape[1], dtype=at.dtype), at + jnp.arange(rows.shape[1], dtype=at.dtype)
     inside = (index >= at) & (index < at + rows.shape[1])
     rows = jnp.where(inside, -(index[None] == own[:, None]).astype(a.dtype), rows)
-    change = matmul(transposed(rows), matmul(inverses, rows))
+    change = matmul(rows.mT, matmul(inverses, rows))
     return jnp.where(inside, 0, jnp.where(inside[:, None], 0, a)) - change
 
 

@@ -152,10 +152,10 @@ def work(settings: Colouring | None, pencil: AnyPencil, times: Float[Array, " m"
         size, d = 2 * times.dtype.itemsize, space.dimension
         if _FILL[d] * float(space.n_dof) ** (2 - 2 / d) * size > _MEMORY:  # dissection is not needed
             return math.inf
-        costs = [inversion_cost(dissect(part.pattern)) for part in pencil.parts]
-        if max(cost.entries for cost in costs) * size > _MEMORY:
+        operations, entries = zip(*(inversion_cost(dissect(part.pattern)) for part in pencil.parts), strict=True)
+        if max(entries) * size > _MEMORY:
             return math.inf
-        return times.size * pole_pairs(times.dtype) * sum(cost.operations for cost in costs) / _FASTER
+        return times.size * pole_pairs(times.dtype) * sum(operations) / _FASTER
     assert isinstance(space, GridSpace)
     products = (settings.degree + 1) * settings.mass_degree
     return 2.0 * len(pencil.parts) * settings.n_vectors(space) * products * 3**space.dimension * space.free.size

@@ -15,7 +15,7 @@ from scipy.linalg import hankel
 from hks_jax.compilation import jit_quickly
 from hks_jax.linear.dissection import Dissection
 from hks_jax.linear.operators import Operator, PatternedOperator, shifted
-from hks_jax.linear.selected_inversion import diagonal_of_inverse
+from hks_jax.linear.selected_inversion import inverse_entries
 
 _TERMS, _SAMPLES, _SCALE = 75, 1024, 9.0
 
@@ -73,7 +73,7 @@ def selected_inversion(
     @jax.checkpoint
     def term(inputs: tuple[Array, Array, Array]) -> Array:
         time, pole, weight = inputs
-        diagonal = diagonal_of_inverse(dissection, shifted(stiffness, mass, pole / time.astype(complex_type)))
+        diagonal = inverse_entries(dissection, shifted(stiffness, mass, pole / time.astype(complex_type)))
         return jnp.real(weight * diagonal) / time
 
     def at(time: Array) -> Array:
