@@ -35,12 +35,12 @@ class Element:
 def element_matrices(
     metric: Float[Array, "q d d"],
     element: Element,
-    form: WeakForm = WeakForm(),  # noqa: B008
-    x: Float[Array, "q m"] | None = None,
-    fields: Mapping[str, Array] | None = None,
+    form: WeakForm,
+    x: Float[Array, "q m"] | None,
+    fields: Mapping[str, Array],
     frames: Float[Array, "q m d"] | None = None,
 ) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
-    """Return stiffness and mass of one element, by default ∫ √|T| T⁻¹∇hᵢ·∇hⱼ and ∫ √|T| hᵢhⱼ.
+    """Return stiffness and mass of one element.
 
     The metric T, the positions x and the fields are given at the quadrature points. With the frames ∂x/∂ξ of the
     element's coordinates ξ, forms see gradients and metric in the axes of space; otherwise in the coordinates ξ.
@@ -54,7 +54,7 @@ def element_matrices(
         dh = product("qxa,qia->qix", dual, dh)
         metric, inverse = (product("qxa,qab,qyb->qxy", f, t, f) for f, t in ((dual, metric), (frames, inverse)))
     functions = of_components(ShapeFunction(h, dh), form.components)
-    points = Point(metric, inverse, x, fields or {})
+    points = Point(metric, inverse, x, fields)
     stiffness, mass = (integrate(each, volume, functions, points) for each in (form.stiffness, form.mass))
     return (stiffness, mass) if form.checked else (symmetric_or_nan(stiffness), symmetric_or_nan(mass))
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.arrays import ByKey
-from hks_jax.compilation import by_numpy, is_concrete_on_cpu, numpy_where_known
+from hks_jax.compilation import numpy_where_known
 from hks_jax.domain.components import active_elements, element_nodes, label_nodes, rim_nodes, wrap_nodes
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.triangulation import Triangulation
@@ -100,10 +100,9 @@ class FunctionSpace(ByKey):
         return values if to == self else to.restrict(self.extend(values, outside=0.0))
 
 
-def _reshaped(values: Array, shape: tuple[int, ...]) -> Array:
-    if np.size(values) <= _COPIED and is_concrete_on_cpu(values):
-        return by_numpy(lambda known: known.reshape(shape), values)
-    return jnp.reshape(values, shape)
+@numpy_where_known(most=_COPIED, static_argnums=1)
+def _reshaped(xp: Any, values: Any, shape: tuple[int, ...]) -> Any:
+    return xp.reshape(values, shape)
 
 
 # The indices are arguments, so that sets of equally many indices share one compilation.

@@ -20,7 +20,7 @@ from hks_jax.fem.sparse_input import pencil_of
 from hks_jax.linear.chebyshev import chebyshev_heat_coefficients
 from hks_jax.linear.dissection import dissect
 from hks_jax.spectrum_free.colours import Colouring
-from hks_jax.spectrum_free.plan import Method, choose_method, plan, require_fewer_vectors, require_grid
+from hks_jax.spectrum_free.plan import Method, choose_method, plan, require_grid
 from hks_jax.spectrum_free.probing import coloured_diagonal
 from hks_jax.spectrum_free.rational import selected_inversion
 from hks_jax.spectrum_free.spectrum_bounds import bounds, mass_bound
@@ -57,9 +57,9 @@ def hks_spectrum_free(
             `Colouring.error` for proofs. Selected inversion does not use it.
 
     Raises:
-        ValueError: if times, tolerance or method are invalid, if the tolerance is below the rounding error (``"auto"``
-            then uses selected inversion if memory suffices), if a time is so large that colouring takes about as many
-            vectors as nodes, if ``"auto"`` takes more than 8 GB on a mesh, or if `jax.jit` lacks a `Colouring`.
+        ValueError: if times, tolerance or method are invalid, if the tolerance is below the rounding error, or a time
+            is so large that colouring takes about as many vectors as nodes (``"auto"`` then uses selected inversion if
+            memory suffices), if ``"auto"`` takes more than 8 GB on a mesh, or if `jax.jit` lacks a `Colouring`.
         TypeError: if colouring is used on a mesh.
 
     Examples:
@@ -109,9 +109,7 @@ def colouring(
     require_number("tolerance", tolerance, 1)
     require_number("memory", memory)
     require_number("slack", slack, above=1, inclusive=True)
-    settings = plan(pencil, times, tolerance, memory, slack)
-    require_fewer_vectors(settings, pencil)
-    return settings
+    return plan(pencil, times, tolerance, memory, slack)
 
 
 def _read_as_unknowns(pencil: AnyPencil) -> AnyPencil:
