@@ -46,8 +46,8 @@ def assemble(
 
     A *field* is a number, an array over the nodes, an array over the elements, or a function of position that JAX can
     trace. An array over the nodes, (*shape) or (V,), is interpolated. An array over the elements has n − 1 entries
-    along each axis of a grid (n if the axis is periodic), or an entry for each cell of a mesh. An array that fits both
-    is taken as nodal.
+    along each axis of a grid (n if the axis is periodic), or an entry for each cell of a mesh. An array whose shape
+    fits both is taken as nodal.
 
     Args:
         domain: a tensor field, a `SurfaceMesh` or a `TetMesh`.
@@ -80,8 +80,8 @@ def assemble(
             all signatures compute nodal values as ½(I + D⁻¹M)φ, where D has the row sums of M.
 
     Returns:
-        The pencil (stiffness, mass). With ``"mirror"`` and ``"mean"`` it is the `MirrorPencil` of the problems into
-        which the doubled domain decomposes. With a potential or your own form, the null space is not known.
+        The pencil (stiffness, mass). With ``"mirror"`` and ``"mean"`` the result is the `MirrorPencil` of the problems
+        into which the doubled domain decomposes. With a potential or your own form, the null space is not known.
 
     Raises:
         ValueError: an unknown boundary, mass, degree or quadrature; a domain without elements or free nodes; ``"mean"``
@@ -133,10 +133,10 @@ def assemble(
         if domain._tensors is not None and domain._tensors.ndim > domain.grid.dimension + 2:
             raise ValueError("domain: got a batch of tensor fields; expected one field. Map over the batch by jax.vmap")
         if degree != 1 or midpoints is not None:
-            raise ValueError(f"degree, midpoints: got {degree!r} for a grid, whose elements are Q1; leave both out")
+            raise ValueError("degree, midpoints: got one of them for a grid, whose elements are Q1; leave both out")
         sides = normalise_boundary(boundary, domain.grid.dimension)
         if components > 1 and any("mirror" in pair for pair in sides):
-            raise ValueError('boundary: got "mirror" with components; expected a boundary for vector-valued functions')
+            raise ValueError('boundary: got "mirror" with components; only scalar functions support "mirror"')
         spaces = [grid_space(domain.grid, problem) for problem in doubled_problems(sides)]
         if any("dirichlet" in pair for pair in sides) and (spaces[0].free == spaces[0].domain).all():
             where = (
@@ -183,9 +183,9 @@ def _checked_operator(
             "the field in the form"
         )
     if (given or components > 1) and not own:
-        raise ValueError("fields, components: these are for a form of your own; pass it as stiffness= or mass=")
+        raise ValueError("fields, components: only a form of your own can use them; pass a form as stiffness= or mass=")
     if components > 1 and stiffness is None:
-        raise ValueError("stiffness: got None with components; expected a form for functions with several components")
+        raise ValueError("stiffness: got None with components > 1; expected a form for vector-valued functions")
     of_mass = mass if callable(mass) else l2
     return WeakForm(stiffness or laplace_beltrami, of_mass, mass == "lumped", components, own), given | named
 

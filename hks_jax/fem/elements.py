@@ -42,8 +42,8 @@ def element_matrices(
 ) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
     """Return stiffness and mass of one element.
 
-    The metric T, the positions x and the fields are given at the quadrature points. With the frames ∂x/∂ξ of the
-    element's coordinates ξ, forms see gradients and metric in the axes of space; otherwise in the coordinates ξ.
+    The metric T, the positions x and the fields are given at the quadrature points. If the frames ∂x/∂ξ are given,
+    gradients and metric in forms refer to the axes of space, otherwise to the element's coordinates ξ.
     """
     h, dh = jnp.asarray(element.values, metric.dtype), jnp.asarray(element.gradients, metric.dtype)
     volume = jnp.asarray(element.weights, metric.dtype) * jnp.sqrt(spd.determinant(metric))
@@ -86,8 +86,8 @@ def _linear_rule(d: int) -> tuple[Float[np.ndarray, "q n"], Float[np.ndarray, " 
     return points, np.full(d + 1, 1 / math.factorial(d + 1))
 
 
-# Radon's rule has 7 points in a triangle, and Keast's has 15 points in a tetrahedron: the centre, two orbits near the
-# corners and, in 3D, one orbit near the midpoints of the edges.
+# Radon's rule has 7 points in a triangle, and Keast's has 15 points in a tetrahedron: the centre, an orbit near the
+# corners, an orbit near the centres of the sides and, in 3D, an orbit near the midpoints of the edges.
 def _quadratic_rule(d: int) -> tuple[Float[np.ndarray, "q n"], Float[np.ndarray, " q"]]:
     """Return the barycentric coordinates and weights of a rule that is exact for degree five."""
     root, n = math.sqrt(15), d + 1
@@ -140,10 +140,10 @@ energy."""
 #
 #     λ + λ μ Σₐ θₐ² − Σₐ Aₐₐkₐ² (θₐ²/12 + ν Σ_{b≠a} θᵦ²) − Σ_{a<b} 2Aₐᵦkₐkᵦ ((θₐ² + θᵦ²)/6 + ν Σ_{c≠a,b} θ_c²).
 #
-# For μ = ν = 1/12 the error −Σ_{a<b} 2Aₐᵦkₐkᵦ (θₐ² + θᵦ²)/12 remains, which is zero for a diagonal tensor. Otherwise no
-# stencil with 3^d couplings cancels it for every k. But ν = 1/12 + δ cancels the mean of the error over the heat
-# kernel, in which θ is normal with a covariance proportional to S, where Sₐᵦ = hₐhᵦTₐᵦ. Let A now be the inverse of S.
-# With Isserlis' theorem E θₐθᵦθ_cθ_e = SₐᵦS_ce + Sₐ_cSᵦ_e + Sₐ_eSᵦ_c,
+# For μ = ν = 1/12 the error −Σ_{a<b} 2Aₐᵦkₐkᵦ (θₐ² + θᵦ²)/12 remains, which is zero for a diagonal tensor. For other
+# tensors, no stencil with 3^d couplings cancels the error for every k. But ν = 1/12 + δ cancels the mean of the error
+# over the heat kernel, in which θ is normal with a covariance proportional to S, where Sₐᵦ = hₐhᵦTₐᵦ. Let A now be the
+# inverse of S. With Isserlis' theorem E θₐθᵦθ_cθ_e = SₐᵦS_ce + Sₐ_cSᵦ_e + Sₐ_eSᵦ_c,
 #
 #     δ = −(1/12) Σ_{a<b} 2Aₐᵦ E(θₐ³θᵦ + θₐθᵦ³) / (Σ_{a≠b} Aₐₐ E θₐ²θᵦ² + Σ_{a<b} Σ_{c≠a,b} 2Aₐᵦ E θₐθᵦθ_c²);
 #

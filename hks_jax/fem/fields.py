@@ -56,10 +56,10 @@ def checked_field(
     Functions are evaluated at the quadrature points; `positions` is called only for functions.
 
     Raises:
-        ValueError: another shape; values that are NaN, infinite or not positive (the message gives them).
+        ValueError: another shape; values that are NaN, infinite or not positive (the message has their number).
     """
     values, at, inside = _placed(name, given, space, positions)
-    # If a field has several numbers at each place, one wrong number makes the place wrong.
+    # If a field has several numbers at each place, a place with one wrong number counts as wrong.
     rest = values.ndim - (0 if inside is None else inside.ndim)
     if scalar and rest:
         raise ValueError(f"{name}: got shape {values.shape}; expected one number at each place: {_expected(space)}")

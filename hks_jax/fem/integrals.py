@@ -52,7 +52,7 @@ def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace
 
 
 def grid_points(grid: Grid, space: GridSpace, dtype: Any) -> Float[Array, "*elements q d"]:
-    """Return the positions of the quadrature points; for elements outside the domain, those of an element inside."""
+    """Return the positions of the quadrature points; elements outside the domain get the positions of one inside."""
     first = np.argwhere(space.elements)[0].astype(dtype)
     corners = np.array(list(product((0.0, 1.0), repeat=space.dimension)))
     inner = tensor_product_element(space.dimension).values @ corners

@@ -87,7 +87,7 @@ def lump(stiffness: Stencil, mass: Stencil, free: Bool[Array, "*shape"], domain:
 
 
 def nodal_pencil(pencil: Pencil) -> NodalPencil:
-    """Return the pencil of a grid on nodal arrays."""
+    """Return the matrices of a grid's pencil as stencils on nodal arrays."""
     space = pencil.space
     assert isinstance(space, GridSpace)
     stiffness, mass = (
@@ -121,7 +121,7 @@ def on_all_nodes(pencil: AnyPencil, k: int = 0) -> AnyPencil:
 
     Each node i that is not free gets a separate equation, Kᵢᵢ = σMᵢᵢ, with an eigenvalue σ above the lowest quarter of
     the spectrum; the other eigenvectors vanish at this node. The pencil is returned unchanged if the number k of pairs
-    exceeds that quarter, or if values are traced, since code is then compiled for each mask anyway.
+    exceeds a quarter of its size, or if values are traced, since code is then compiled for each mask anyway.
     """
     parts = tuple(_of_one(part) if 4 * k <= part.size else part for part in pencil.parts)
     return parts[0] if isinstance(pencil, Pencil) else MirrorPencil(parts, pencil.including)

@@ -96,7 +96,7 @@ class FunctionSpace(ByKey):
             return _reshaped(_spread(values, self._free_indices, fill), shape)
 
     def transfer(self, values: Float[Array, "... n_dof"], to: "FunctionSpace") -> Float[Array, "... n"]:
-        """Return functions of this space as functions of another space on the same nodes, with its Dirichlet nodes."""
+        """Convert functions to another space on the same nodes; the results are 0 at Dirichlet nodes of that space."""
         return values if to == self else to.restrict(self.extend(values, outside=0.0))
 
 
@@ -273,7 +273,7 @@ def _coupled(free: Bool[np.ndarray, "*shape"], periodic: tuple[bool, ...]) -> Bo
 
 
 def _box(mask: Bool[np.ndarray, "*shape"]) -> list[Bool[np.ndarray, " _n"]] | None:
-    """Return a mask for each axis, whose product is the given mask; None if it is not such a product."""
+    """Return one mask per axis, such that their outer product is the given mask; None if there are no such masks."""
     d = mask.ndim
     axes = [np.asarray(mask.any(axis=tuple(a for a in range(d) if a != axis))) for axis in range(d)]
     return axes if mask[np.ix_(*axes)].all() else None
@@ -285,7 +285,7 @@ def _outer(axes: Sequence[Bool[np.ndarray, "_m _n"]]) -> Bool[Array, "ms *ns"]:
     whole = tuple(map(int, shapes.ravel()))
     result = jnp.ones((), bool)
     if not all(axis.all() for axis in axes):
-        # The barrier keeps the compiler from computing the product when it compiles.
+        # The barrier keeps the compiler from computing the product during compilation.
         known = jax.lax.optimization_barrier([jnp.asarray(axis) for axis in axes])
         places = [tuple(n if i % d == axis else 1 for i, n in enumerate(whole)) for axis in range(d)]
         result = reduce(jnp.logical_and, [axis.reshape(place) for axis, place in zip(known, places, strict=True)])

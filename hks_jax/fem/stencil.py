@@ -211,7 +211,7 @@ class StencilOperator(PatternedOperator):
         shape, coefficients = self.space.node_shape, list(self.coefficients)
 
         def product_with(row: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-            # The barrier makes the neighbours slices of an array. Without it XLA would compute the padding per node.
+            # With the barrier, the neighbours are slices of an array. Otherwise XLA would compute the padding per node.
             rimmed = jax.lax.optimization_barrier(with_rim(row, self.space.periodic))
             terms = zip(coefficients, neighbours(rimmed, len(shape)), strict=True)
             return reduce(add, (c * shifted for c, shifted in terms))

@@ -37,7 +37,7 @@ class Parts(NamedTuple):
 
     # the level of the separator that contains each vertex; vertices of the undivided cells have the last level
     level: Int[np.ndarray, " n"]
-    part: Int[np.ndarray, " n"]  # the index within the level of the part whose separator (or cell) contains it
+    part: Int[np.ndarray, " n"]  # the number, in its level, of the part whose separator (or cell) has the vertex
     depth: int  # the number of levels
 
 

@@ -131,10 +131,10 @@ def lanczos_bound(
 ) -> Scalar:
     """Return an upper bound of the eigenvalues of PK by Lanczos iteration.
 
-    From a random start, the largest Ritz value θ of k steps satisfies λ(1 − ε) ≤ θ ≤ λ with probability at least
-    1 − 1.648 √n exp(−√ε (2k − 1)) (Kuczyński and Woźniakowski 1992, theorem 4.2). The result is θ/(1 − ε) for the ε at
-    which the probability of failure is 10⁻⁶. The start is normally distributed with respect to D instead of P⁻¹; a
-    safety factor accounts for the difference.
+    From a random start, the largest Ritz value θ of k steps and the largest eigenvalue λ satisfy λ(1 − ε) ≤ θ ≤ λ with
+    probability at least 1 − 1.648 √n exp(−√ε (2k − 1)) (Kuczyński and Woźniakowski 1992, theorem 4.2). The result is
+    θ/(1 − ε) for the ε at which the probability of failure is 10⁻⁶. The start is normally distributed with respect to D
+    instead of P⁻¹; a safety factor accounts for the difference.
     """
     r = jnp.sqrt(sums) * jax.random.normal(jax.random.key(0), sums.shape, sums.dtype)
 

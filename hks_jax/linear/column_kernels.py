@@ -1,8 +1,8 @@
 """Kernels for CUDA devices that fuse the operations of block Lanczos on blocks of a few long columns.
 
-By XLA operations, inner products and the combinations that use them take four launches: for partial sums, their sum, a
-small matrix computed from the sum, and combinations of columns. In this module, the partial sums are the input of a
-second kernel. Each of its programs adds the partial sums, computes the small matrix, and combines its own rows.
+With XLA operations, inner products and the combinations that use them take four launches: for partial sums, their sum,
+a small matrix computed from the sum, and combinations of columns. In this module, the partial sums are the input of a
+second kernel. Each program of this kernel adds the partial sums, computes the small matrix, and combines its own rows.
 """
 
 from collections.abc import Callable
@@ -82,10 +82,10 @@ def remainder(x: Block, block: Block, parts: Parts, before: tuple[Block, Small] 
 
 
 def orthonormal(parts: Parts, columns: tuple[Block, ...], before: Small) -> tuple[tuple[Block, ...], Small]:
-    """Return columns times F⁻ᵀ, and ``before`` times F, where FFᵀ = G, given partial sums of G (at most 32 rows).
+    """Return columns times F⁻ᵀ, and ``before`` times F, where FFᵀ = G, given partial sums of G; G has at most 32 rows.
 
     If G = xᵀMx, the columns of xF⁻ᵀ are M-orthonormal. F is computed by pivoted Cholesky factorisation of G, scaled to
-    unit diagonal. Pivots below rounding level, which belong to linearly dependent columns, are raised to it.
+    unit diagonal. Pivots below rounding level, which belong to linearly dependent columns, are raised to this level.
     """
     b = len(before)
     floor = b * float(jnp.finfo(before.dtype).eps)

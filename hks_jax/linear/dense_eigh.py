@@ -52,7 +52,7 @@ def eigh(A: Any, B: Any = None, *, multiplet_tolerance: float | None = None) -> 
         A: (n, n), symmetric, float32 or float64. Derivatives are with respect to the symmetric part of A.
         B: (n, n), symmetric positive definite; None: the identity.
         multiplet_tolerance: eigenvalues count as equal in derivatives if they differ by less than this, relative to the
-            largest |λ|. None is 4nε, about the effect of rounding.
+            largest |λ|. None means 4nε, about the effect of rounding.
 
     Returns:
         (n,) eigenvalues, ascending, and (n, n) eigenvectors in columns.

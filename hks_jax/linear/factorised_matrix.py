@@ -75,8 +75,8 @@ class FactorisedMatrix(eqx.Module):
 
     @property
     def inertia(self) -> Inertia:
-        """The numbers of negative and positive eigenvalues of A; if A = K − σM, of eigenvalues λ of the pencil below
-        and above σ."""
+        """The counts of A's negative and positive eigenvalues; for K − σM, of the pencil's eigenvalues below and above
+        σ."""
         negative = self.factor.negative
         counts = negative, jnp.asarray(self.size, negative.dtype) - negative
         return Inertia(*(jnp.where(self.sound, count, -1) for count in counts))

@@ -88,10 +88,10 @@ def factorise(dissection: Dissection, matrix: Float[Array, " m"], least: Scalar 
     return Factorisation(dissection, *_eliminate(dissection, matrix, least))
 
 
-# Let the computed LDLᵀ be F = A + E, where A = K − σM. If the spectral radius of EF⁻¹ is below one, the matrix
-# F − tE = (1 − tEF⁻¹)F is regular for all t in [0, 1]. So no eigenvalue crosses zero, and F and A have equal inertia.
-# For x = F⁻¹b, the residual b − Ax equals EF⁻¹b, so that repeated solves with residuals are a power iteration. If the
-# first residual is tiny, one step suffices, as a random b has a component of order 1/√n along every direction.
+# Let the computed LDLᵀ be F = A + E, where A = K − σM. If the spectral radius of EF⁻¹ is below one, then F − tE = (1 −
+# tEF⁻¹)F is nonsingular for all t in [0, 1]. So no eigenvalue crosses zero, and F and A have equal inertia. For x =
+# F⁻¹b, the residual b − Ax equals EF⁻¹b, so that repeated solves with residuals are a power iteration. If the first
+# residual is tiny, one step suffices, as a random b has a component of order 1/√n along every direction.
 @jit_quickly()
 def try_out(factor: Factorisation, pencil: SymmetricPencil, shift: Scalar, b: Float[Array, "n_dof b"]) -> Trial:
     """Measure the accuracy of a factorisation with random right-hand sides b."""

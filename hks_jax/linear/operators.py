@@ -251,7 +251,7 @@ def require_symmetric(
 ) -> None:
     """Raise ValueError unless a matrix is finite and symmetric. Entries at equal places are added.
 
-    The limit of asymmetry is relative to the largest entry; None is the level of rounding.
+    The limit of asymmetry is relative to the largest entry; None means the level of rounding.
     """
     data, (rows, cols) = np.asarray(values), places
     wrong = int((~np.isfinite(data)).sum())

@@ -32,7 +32,7 @@ class Pattern:
 
 
 class Ellpack(NamedTuple):
-    """A pattern in ELLPACK format: a table with one row of slots per matrix row, and a list of overflowing entries."""
+    """A pattern in ELLPACK format: a table with a few slots for each matrix row, and a list of further entries."""
 
     entries: Int[np.ndarray | Array, "width n"]  # indices of the entries in the table; out of range for empty slots
     cols: Int[np.ndarray | Array, "width n"]  # the columns of these entries

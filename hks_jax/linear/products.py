@@ -118,9 +118,9 @@ _POINTS = 2048
 def quadratic_forms(
     matrices: Float[Array, "m k k"], vectors: Float[Array, "k n"], matters: Bool[Array, "m k"]
 ) -> Float[Array, "m n"]:
-    """Return Σᵢⱼ Cᵢⱼ φᵢ(x) φⱼ(x) for each C; not differentiable with respect to φ.
+    """Return Σᵢⱼ Cᵢⱼ φᵢ(x) φⱼ(x) for each matrix C; not differentiable with respect to φ.
 
-    Entries of C between functions that do not matter for this C may be treated as zero.
+    Entries of C for pairs of functions that do not matter for this C may be treated as zero.
     """
     (m, k), n = matters.shape, vectors.shape[1]
     size, width = min(max(_OF_MATRIX, -(-k // _BLOCKS)), k), min(_POINTS, n)

@@ -5,8 +5,8 @@ elimination, the coupling B to its boundary, and C = BA⁻¹. Then the inverse G
 
     G_own = A⁻¹ + Cᵀ G_b C,    G_b,own = −G_b C,
 
-where G_b is its block at the boundary. A front's boundary nodes are own or boundary nodes of the front above. So the
-recursion goes from the first separator down to the cells, and each level needs only blocks of the level above. The
+where G_b is the block of G at the boundary. A front's boundary nodes are own or boundary nodes of the front above. So
+the recursion goes from the first separator down to the cells, and each level needs only blocks of the level above. The
 recursion takes about as many operations as the factorisation, O(N^1.5) in 2D and O(N²) in 3D: L. Lin and others,
 SelInv, ACM Trans. Math. Softw. 37 (2011).
 """
@@ -27,7 +27,7 @@ Eliminated = list[tuple[Inexact[Array, "_fronts _s _s"], Inexact[Array, "_fronts
 def inverse_entries(
     dissection: Dissection, matrix: Inexact[Array, " m"], diagonal: bool = True
 ) -> Inexact[Array, " entries"]:
-    """Return entries of the inverse of a symmetric matrix, real or complex (not Hermitian), as `selected` does.
+    """Return the entries of `selected` for the inverse of a symmetric matrix, real or complex (not Hermitian).
 
     The elimination does not pivot between fronts. This is safe if the real or imaginary part of the matrix is definite,
     because then no Schur complement is singular. The function is differentiable in both modes; reverse mode stores
@@ -59,7 +59,7 @@ def selected(dissection: Dissection, eliminated: Eliminated, diagonal: bool) -> 
 
 
 def inversion_cost(dissection: Dissection) -> tuple[float, float]:
-    """Estimate the numbers of complex operations, and of entries in memory at the same time, of selected inversion."""
+    """Estimate the number of floating-point operations of a complex selected inversion, and of entries in memory."""
     operations = entries = most = 0.0
     for level in dissection.levels:
         fronts, whole, s = level.shape

@@ -92,7 +92,7 @@ def least_work(pencil: AnyPencil, times: Float[Array, " m"], tolerance: float) -
 
 
 class Unattainable(ValueError):
-    """The error if a method is not possible: colouring by `plan`, or selected inversion on a mesh within the memory."""
+    """The error if colouring is not possible, or if selected inversion on a mesh would exceed the memory."""
 
 
 def plan(
@@ -127,7 +127,7 @@ def plan(
         if not more:
             break
         mass_degree += more  # the upper bound `top` depends slightly on the degree
-    # The value needs five blocks of vectors in memory, its derivatives need eight.
+    # The value needs five blocks of vectors in memory; derivatives need eight.
     columns = int(min(_COLUMNS, max(1, memory // (8 * space.free.size * times.dtype.itemsize))))
     settings = choose(concrete, limits, space, tolerance, mass_degree, columns, eps)
     vectors = settings.n_vectors(space)

@@ -364,9 +364,9 @@ def first_order(u, v, w):
         ({"stiffness": first_order, "potential": 1.0}, "potential: got a field with your own form"),
         ({"stiffness": "laplace"}, "stiffness: got str; expected a form"),
         ({"mass": "full"}, 'mass: got \'full\'; expected "consistent", "lumped" or a form'),
-        ({"fields": {"a": 1.0}}, "these are for a form of your own"),
+        ({"fields": {"a": 1.0}}, "only a form of your own can use them"),
         ({"stiffness": elasticity, "components": 2, "boundary": "mirror"}, 'got "mirror" with components'),
-        ({"degree": 2}, "degree, midpoints: got 2 for a grid"),
+        ({"degree": 2}, "degree, midpoints: got one of them for a grid"),
     ],
 )
 def test_bad_operators_are_refused(settings, message):
