@@ -62,7 +62,7 @@ def jit_quickly(
 
         @wraps(function)
         def call(*args: P.args, **kwargs: P.kwargs) -> T:
-            if is_staged() or jax.default_backend() != "cpu":
+            if jax.default_backend() != "cpu" or is_staged():
                 return usual(*args, **kwargs)
             bound = signature.bind(*args, **kwargs)
             if not linear and not is_traced((args, kwargs)):
@@ -129,7 +129,7 @@ def by_numpy(function: Callable[..., Any], *args: Any) -> Any:
 
 def is_concrete_on_cpu(args: Any) -> bool:
     """Return whether all values are concrete, and each is on one CPU device of a single process."""
-    if is_staged() or is_traced(args) or jax.default_backend() != "cpu" or jax.process_count() > 1:
+    if jax.default_backend() != "cpu" or jax.process_count() > 1 or is_traced(args) or is_staged():
         return False
     return all(len(leaf.devices()) == 1 for leaf in jax.tree.leaves(args) if isinstance(leaf, jax.Array))
 
