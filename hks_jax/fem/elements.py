@@ -27,10 +27,6 @@ class Element:
     gradients: Float[np.ndarray | Array, "q n d"]
     weights: Float[np.ndarray | Array, " q"]
 
-    def stretched(self, sides: tuple[float, ...]) -> "Element":
-        """Return the element with its sides multiplied by these factors."""
-        return Element(self.values, self.gradients / np.array(sides), self.weights * math.prod(sides))
-
 
 def element_matrices(
     metric: Float[Array, "q d d"],

@@ -33,14 +33,15 @@ def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace
     """Return the pencil of a field, or of one part of a doubled domain."""
     # Masks, element and spacing are passed as arrays, so that problems that differ only in these arrays share one
     # compilation. The element is computed in double precision, since its rounding would scale the whole metric.
-    tensors, spacing = field.tensors, field.grid.spacing
-    element = tensor_product_element(space.dimension).stretched(spacing)
-    gradients, weights, steps = (np.asarray(x, tensors.dtype) for x in (element.gradients, element.weights, spacing))
+    tensors, spacing = field.tensors, np.array(field.grid.spacing)
+    element = tensor_product_element(space.dimension)
+    table = element.gradients / spacing, element.weights * spacing.prod(), spacing
+    gradients, weights, steps = (np.asarray(x, tensors.dtype) for x in table)
     domain, elements = (mask_for(tensors, mask) for mask in (space.domain, space.elements))
     couplings, settings = couplings_for(tensors, space), (space.periodic, field.interpolation, operator)
     x = grid_points(field.grid, space, tensors.dtype) if operator.own else None
-    table = gradients, weights, steps
-    *matrices, lumped, volume = _grid_integrals(tensors, domain, elements, couplings, *table, x, fields, *settings)
+    arrays = tensors, domain, elements, couplings, gradients, weights, steps
+    *matrices, lumped, volume = _grid_integrals(*arrays, x, fields, *settings)
     metric = SampledMetric(jax.lax.stop_gradient(tensors), steps, field.interpolation)
     if operator.components > 1:
         own, kept = vector_space(space, operator.components), np.flatnonzero(space.elements)

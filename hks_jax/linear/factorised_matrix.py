@@ -75,7 +75,7 @@ class FactorisedMatrix(eqx.Module):
 
     @property
     def inertia(self) -> Inertia:
-        """Counts of A's negative and positive eigenvalues; for K − σM, of the pencil's eigenvalues below and above σ."""
+        """Counts of A's negative and positive eigenvalues; for K − σM, of the pencil's eigenvalues λ < σ and λ > σ."""
         negative = self.factor.negative
         counts = negative, jnp.asarray(self.size, negative.dtype) - negative
         return Inertia(*(jnp.where(self.sound, count, -1) for count in counts))
