@@ -130,7 +130,7 @@ class GridSpace(FunctionSpace):
     """
 
     def __init__(self, grid: Grid, boundary: tuple[Sides, ...]) -> None:
-        self._grid, self.boundary = grid.unit, boundary
+        self.boundary = boundary
         self.node_shape, self.dimension = grid.shape, grid.dimension
         *axes, rim = boundary
         self.periodic = tuple(sides == ("periodic", "periodic") for sides in axes)
@@ -153,7 +153,7 @@ class GridSpace(FunctionSpace):
                 "finer grid or a thicker mask"
             )
         self._labels, self.n_components = label_nodes(grid.inside, self.periodic)
-        self._key = (self._grid, boundary)
+        self._key = (grid.unit, boundary)
 
     @cached_property
     def cells(self) -> Int[np.ndarray, "E n"]:

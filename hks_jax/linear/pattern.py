@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Int
 
-from hks_jax.arrays import StaticArray
+from hks_jax.arrays import ByKey, StaticArray
 from hks_jax.linear.bisection import Parts, bisect_graph
 
 
@@ -47,22 +47,16 @@ _SCATTERED = 3
 
 
 @jax.tree_util.register_static
-class SparsePattern(Pattern):
+class SparsePattern(ByKey, Pattern):
     """A symmetric pattern with a full diagonal. Entries are sorted by row, then by column."""
 
+    rows: Int[np.ndarray, " m"]  # the row of each entry
+    cols: Int[np.ndarray, " m"]  # the column of each entry
+
     def __init__(self, size: int, rows: Int[np.ndarray, " m"], cols: Int[np.ndarray, " m"]) -> None:
-        self.size, self.n_entries = size, len(rows)
-        self._rows, self._cols = StaticArray(rows, np.int32), StaticArray(cols, np.int32)
-
-    @property
-    def rows(self) -> Int[np.ndarray, " m"]:
-        """The row of each entry."""
-        return self._rows.value
-
-    @property
-    def cols(self) -> Int[np.ndarray, " m"]:
-        """The column of each entry."""
-        return self._cols.value
+        places = StaticArray(rows, np.int32), StaticArray(cols, np.int32)
+        self.size, self.n_entries, self._key = size, len(rows), (size, *places)
+        self.rows, self.cols = (each.value for each in places)
 
     def places(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return for each place its index into the array of entries, its row, and its column."""
@@ -98,12 +92,3 @@ class SparsePattern(Pattern):
         others = np.flatnonzero(np.arange(self.rows.size) - start[self.rows] >= width)
         fields = entries, cols, others, self.rows[others], self.cols[others], self.diagonal()
         return Ellpack(*(field.astype(np.int32) for field in fields))
-
-    def __eq__(self, other: object) -> bool:
-        return self is other or (
-            isinstance(other, SparsePattern)
-            and (self.size, self._rows, self._cols) == (other.size, other._rows, other._cols)
-        )
-
-    def __hash__(self) -> int:
-        return hash((self.size, self._rows, self._cols))
