@@ -131,7 +131,7 @@ class Slabs:
         return jax.jit(self._padded, static_argnums=1, out_shardings=NamedSharding(self.mesh, self.spec(axis)))(x, axis)
 
     def join(self, x: Array, axis: int = 0) -> Array:
-        """Remove the padding. If there was any, every device holds the whole result."""
+        """Remove the padding. If there was padding, every device holds the whole result."""
         return jax.lax.slice_in_dim(x, 0, self.shape[0], axis=axis)
 
     @partial(jax.jit, static_argnums=0)

@@ -84,7 +84,7 @@ def differentiable_eigh(tolerance: float | None, a: Matrix) -> tuple[Values, Mat
     return lapack.eigh(a)
 
 
-# From AV = VΛ and VᵀV = I, with G = VᵀȦV,
+# The equations AV = VΛ and VᵀV = I give, with G = VᵀȦV,
 #
 #     λ̇ᵢ = Gᵢᵢ,    V̇ = VΩ,    Ωᵢⱼ = Gᵢⱼ/(λⱼ − λᵢ) for i ≠ j.
 #

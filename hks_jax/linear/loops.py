@@ -48,7 +48,7 @@ def by_column_ranges(function: Callable[[jax.Array], jax.Array], width: int, x: 
 
 
 def when(condition: Any, function: Callable[[State], State], state: State) -> State:
-    """Return ``function(state)`` if the condition holds, otherwise the state; by `jax.lax.cond` if it is traced."""
+    """Return ``function(state)`` if the condition holds, otherwise the state; if traced, by `jax.lax.cond`."""
     if is_traced(condition):
         return jax.lax.cond(condition, function, lambda state: state, state)
     return function(state) if condition else state

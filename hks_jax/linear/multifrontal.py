@@ -148,7 +148,7 @@ def _eliminate(
 
 
 def _merged(levels: tuple[Level, ...], merged: Merged, downward: Blocks, upward: Blocks) -> tuple[Blocks, Blocks]:
-    """Return the matrices of merged levels, each by substitution of the identity along the tree levels in it."""
+    """Return the matrices of merged levels, by substitution along the levels of each group, applied to the identity."""
     inverses, couplings, first = [], [], 0
     for rows, places in zip(merged.rows, merged.places, strict=True):
         (fronts, s), group = places.shape, slice(first, first + len(rows))

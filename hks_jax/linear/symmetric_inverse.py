@@ -53,7 +53,7 @@ def _kernel_agrees(dtype: Any) -> bool:
 
 
 def by_cholesky_factors(matrices: Matrices, least: Pivots) -> Inverses:
-    """Invert by Cholesky factors, in a third of the time; by eigenvalues if a pivot is negative or small."""
+    """Invert by Cholesky factors, or by eigenvalues, three times as slow, if a pivot is negative or small."""
     inverses = jax.vmap(lapack.inverse_cholesky)(matrices)
     pivots = jnp.diagonal(inverses, axis1=1, axis2=2) ** -2
     return jax.lax.cond(
