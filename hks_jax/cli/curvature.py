@@ -32,7 +32,7 @@ OPTIONS = f"""
 """
 
 COLOURED = 0.98
-"""The quantile of absolute values at the ends of the colour scale; differences of noisy tensors have outliers."""
+"""The quantile of absolute values at the ends of the colour scale; the curvature of noisy tensors has outliers."""
 
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:

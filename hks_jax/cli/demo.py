@@ -39,7 +39,7 @@ RIM = 2
 SPREADS = 2.5 * 2 ** (np.arange(7) / 2)
 """The diffusion lengths √(Dt) at the drawn times, in voxels, from one voxel to the size of the brain."""
 N_PAIRS = 600
-"""The number of eigenpairs, for both boundary problems together, that the first time needs."""
+"""The number of eigenpairs of both boundary problems together that the smallest time needs."""
 PHANTOM_SHAPE = (72, 80)
 
 

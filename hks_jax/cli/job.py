@@ -32,7 +32,7 @@ class ComputationError(RuntimeError):
 class Settings:
     """The settings of a computation, with the names of the options.
 
-    The metric is None only for meshes. The boundary None means `default_boundary` for a volume, natural for a mesh.
+    The metric is None only for meshes. The boundary None means `default_boundary` for a volume, neumann for a mesh.
     """
 
     metric: MetricChoice | None
@@ -48,7 +48,7 @@ class Settings:
 
     @classmethod
     def of(cls, args: argparse.Namespace | None = None, **given: Any) -> "Settings":
-        """Return the settings in `args`, or the defaults, where `given` replaces some."""
+        """Return the settings in `args`, or the default settings, with the settings in `given` in place of some."""
         chosen = vars(defaults(f"@metric {SOLVING} @signature")) | (vars(args) if args else {})
         given = {"metric": chosen["metric"] or "tensor", "times": parse_times(chosen["times"]), **given}
         return cls(**{field.name: chosen[field.name] for field in fields(cls)} | given)
@@ -74,7 +74,7 @@ class Solved(NamedTuple):
 
 
 def use_dtype(dtype: str) -> None:
-    """Enable float64 in JAX if `dtype` is ``"float64"``; applications do so before they create arrays."""
+    """Enable float64 in JAX if `dtype` is ``"float64"``; call it before arrays are created."""
     if dtype == "float64":
         jax.config.update("jax_enable_x64", True)
 

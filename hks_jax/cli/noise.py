@@ -21,7 +21,7 @@ from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result
 
 _CANDIDATES = 4
-"""The number of candidates per automatic time."""
+"""The number of candidate times for each automatic time."""
 _SIGNAL = 1.0
 """The signal-to-noise ratio at which automatic times begin."""
 _RIM = 0.1
@@ -139,7 +139,7 @@ def _error_bars(
         maps.append(np.asarray(one, np.float32))
 
     with progress.stage("error bars", f"{args.draws} noisy maps"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", hj.AccuracyWarning)  # some warnings concern unused times
+        warnings.simplefilter("ignore", hj.AccuracyWarning)  # some warnings concern candidate times that are not chosen
         tensors, more = noisy.tensors.astype(settings.dtype), {"draws": args.draws, "each": keep}
         more |= {"compiled": noisy.traceable, "progress": progress.update}
         bars = hj.uncertainty(signature, tensors, noisy.noise, method="resample", **more)

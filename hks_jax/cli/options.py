@@ -208,7 +208,7 @@ def options_in(text: str) -> list[Option]:
 
 
 SPELLED = [option.name for option in options_in(f"{READING} @metric {SOLVING} @signature")]
-"""The options that correspond to arguments of the library."""
+"""The names of options that correspond to arguments of the library."""
 
 
 def add_options(parser: argparse.ArgumentParser, text: str) -> None:
@@ -256,7 +256,7 @@ def as_options(message: str, names: Iterable[str] = SPELLED) -> str:
 FILES = [o.name for o in options_in("@voxels @dwi @atlas @names") if o.settings.get("type") is Path]
 """Options whose values are files of a subject."""
 COLUMNS = [o.flags[-1][2:] for o in options_in(f"{READING} @noise") if o.name not in FILES]
-"""Columns in a table of subjects with the meaning of the option of the same name (for reading tensors and noise)."""
+"""The columns of a table of subjects that have the meaning of the option with the same name."""
 
 _LISTS = {"meshes": MESHES, "written": WRITTEN, "files": FILES, "columns": COLUMNS}
 

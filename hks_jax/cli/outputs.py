@@ -48,7 +48,7 @@ def writing(
 ) -> Iterator[tuple[Path, Done]]:
     """Yield a temporary folder, and a `Done` to which the report and the paths of the results are added at the end.
 
-    Then the function also writes report.json, moves all files to `folder` atomically, and deletes the `stale` files.
+    At the end, report.json is written, all files are moved to `folder` atomically, and the `stale` files are deleted.
     """
     done = Done([], {})
     with progress.stage("writing", str(folder)), atomic_folder(folder, stale) as temporary:
@@ -70,7 +70,7 @@ def write_outputs(folder: Path, result: Result, progress: Progress, draw: Callab
 
 
 def of_earlier(folder: Path, eigenvalues: np.ndarray, progress: Progress) -> list[Path]:
-    """Return the files of an earlier signature in a folder, without a file of eigenpairs with these eigenvalues."""
+    """Return the files of an earlier signature in a folder, except eigenpairs with these eigenvalues."""
     found, own, pairs = [], [], folder / PAIRS
     if signature_file(folder).is_file():  # otherwise, another program wrote the files
         regions = ("regions.json", "regions.tsv") if (folder / "regions.json").is_file() else ()

@@ -50,7 +50,7 @@ def write_pairs(path: Path, solved: Solved, image: str, warnings: Sequence[str],
 
 
 def are_of(path: Path, fingerprint: str) -> bool:
-    """Return whether a file contains eigenpairs with the same fingerprint, that is of the same files and settings."""
+    """Return whether a file contains eigenpairs with this fingerprint of input files and settings."""
     if not is_saved_pairs(path):
         return False
     with np.load(path) as arrays:  # reads only the array that is used
@@ -58,7 +58,7 @@ def are_of(path: Path, fingerprint: str) -> bool:
 
 
 def read_pairs(path: Path, settings: Settings, progress: Progress) -> tuple[Solved, str]:
-    """Return the eigenpairs with `settings` (and with the settings that the file determines), and the image suffix."""
+    """Return saved eigenpairs and the suffix of images; settings in the file replace settings in `settings`."""
     arrays = load_npz(path)
     record: dict[str, Any] = json.loads(str(arrays[_RECORD]))
     about = {name: record[name] for name in _ABOUT if name in record} | {"notes": tuple(record["notes"])}

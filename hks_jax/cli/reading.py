@@ -44,7 +44,8 @@ def read_volume(args: argparse.Namespace, progress: Progress) -> TensorVolume:
 def read(args: argparse.Namespace, progress: Progress, ask: Callable[[str], None] | None = None) -> TensorVolume:
     """Read or fit the tensors, and apply the options for the slice, the mask and the repair.
 
-    Questions go to `ask` or become warnings. With ``args.strict_unit``, an implausible unit without ``--unit`` fails.
+    Questions about the frame or unit go to `ask` or become warnings. With ``args.strict_unit``, an implausible mean
+    diffusivity without ``--unit`` raises ValueError.
     """
     with progress.stage("reading", str(args.file)):
         volume, mask = _load(args)
@@ -118,7 +119,7 @@ def _without_filling(volume: TensorVolume, background: str | None, progress: Pro
 
 def _reviewed(volume: TensorVolume, args: argparse.Namespace, ask: Callable[[str], None]) -> TensorVolume:
     """Ask questions about a wrong frame or unit; return the volume with a note about its fibres."""
-    if args.positive is not None:  # these are not diffusion tensors
+    if args.positive is not None:  # the tensors, such as stresses, are not diffusion tensors
         return volume
     volume, asked = reviewed(volume)
     for question in asked:

@@ -90,7 +90,7 @@ def region_table(
     cells = {name: np.tile(of, n_regions) for name, of in by_time.items() if of is not None}
     cells |= {name: np.repeat(of, n_times) for name, of in by_region.items()}
     cells |= {"mean": regions.mean.T.ravel(), "std": regions.deviation.T.ravel(), "median": regions.median.T.ravel()}
-    if "noise_maps" in result.arrays:  # the variance of the mean is that of means of noise
+    if "noise_maps" in result.arrays:  # the error of a regional mean comes from means of noisy maps
         draws = [region_statistics(one, labels).mean for one in result.arrays["noise_maps"]]
         cells["error"] = np.sqrt(np.mean(np.square(draws), axis=0)).T.ravel()
     about = {name: of for name, of in _about(result, atlas, names).items() if name in cells or name[0].isupper()}

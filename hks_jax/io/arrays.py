@@ -61,7 +61,7 @@ def _read_tensors(
 
 
 def volume_of(name: str, arrays: Mapping[str, Any], tensors: Float[np.ndarray, "..."], **about: Any) -> TensorVolume:
-    """Return a volume at the position that `place_of` wrote, by default with a spacing of 1 and the origin 0."""
+    """Return a volume of `tensors` at the position in `arrays` (see `place_of`), by default spacing 1 and origin 0."""
     mask, affine, d = arrays.get("mask"), arrays.get("affine"), tensors.shape[-1] if tensors.ndim else 0
     return TensorVolume(
         tensors,

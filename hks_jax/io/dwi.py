@@ -23,7 +23,7 @@ from hks_jax.storage import existing, reading
 _LENGTH = 0.05
 """The largest difference of a direction's length from 1 that is attributed to rounding."""
 _SEEN = 0.01
-"""The least ratio 1 − h of a residual's variance to the variance of the noise for which the residual is used."""
+"""A residual is used if the ratio 1 − h of its variance to the variance of the noise is above this value."""
 
 
 class ExampleBrain(NamedTuple):
@@ -83,8 +83,8 @@ def fit_dwi(
             ``"um2/ms"`` for ms/µm². None means mm²/s.
         noise: the standard deviation of the images' noise, in the images' unit, from which the tensors' covariance is
             computed. ``"residuals"`` estimates the deviation in each voxel from the residuals of the fit, which have
-            n − 7 degrees of freedom, and also keeps the noise of an image that voxels share (24 bytes for each voxel
-            and image). If None, no covariance is computed.
+            n − 7 degrees of freedom, and also keeps the contribution of each image to the noise, which voxels may share
+            (24 bytes for each voxel and image). If None, no covariance is computed.
 
     Returns:
         Tensors along the voxel axes, in mm²/s, and with `noise` their noise to first order (`TensorVolume.noise`). DIPY
@@ -125,7 +125,7 @@ def fit_dwi(
     if weighted < 6 or weighted == used.sum():
         raise ValueError(
             f"b_max: got {b_max}, which leaves {weighted} weighted and {int(used.sum()) - weighted} unweighted images; "
-            "expected at least 6 and 1. Raise the limit"
+            "expected at least 6 weighted images and 1 unweighted image. Raise the limit"
         )
     directions, remarks = _of_length_one(os.fspath(bvec), directions, used & (b > threshold))
     signal = nifti.voxels(name, image)[..., used]
@@ -172,7 +172,7 @@ def _covariance(
 ) -> tuple[Float[np.ndarray, "nx ny nz 6 6"], Float[np.ndarray, "nx ny nz n 6"] | None]:
     """Return the covariance of the components xx xy yy xz yz zz along the voxel axes, which is zero outside the mask.
 
-    From residuals, also return the contribution of each image to the noise of these components, or else None.
+    If `noise` is ``"residuals"``, also return the contribution of each image to their noise; otherwise None.
     """
     data = np.asarray(signal[inside], np.float64)
     positive = data[data > 0]

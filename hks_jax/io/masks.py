@@ -80,10 +80,10 @@ def erode(mask: Bool[np.ndarray, "*shape"], iterations: int = 1) -> Bool[np.ndar
 
 
 def read_labels(path: str | os.PathLike[str], on: TensorVolume | SimplicialMesh) -> Integer[np.ndarray, "*shape"]:
-    """Read integer labels, with 0 for unlabelled, at an image's voxels or a mesh's vertices, from NIfTI or ``.npy``.
+    """Read integer labels (0 means unlabelled) at the voxels of an image or vertices of a mesh, in NIfTI or ``.npy``.
 
-    If both files have an affine, their voxels must coincide. For a slice, the file may have the labels of the whole
-    volume, or of the slice in two dimensions. Otherwise, the labels must have the shape of the image.
+    If the labels and the image have affines, their voxels must coincide. For a slice, the file may have the labels of
+    the whole volume, or of the slice in two dimensions. Otherwise, the labels must have the shape of the image.
     """
     shape, affine = (on.shape, on.affine) if isinstance(on, TensorVolume) else ((len(on.vertices),), None)
     name = os.fspath(path)

@@ -226,7 +226,7 @@ def _cleaned(loaded: Loaded) -> tuple[Loaded, str]:
 def _without_thin(
     vertices: Float[np.ndarray, "V 3"], cells: Int[np.ndarray, "n 3"]
 ) -> tuple[Int[np.ndarray, "m 3"], int]:
-    """Flip triangles of nearly zero height, or remove them at a boundary; return triangles and number of flips."""
+    """Flip the longest edges of nearly flat triangles, or remove those at a boundary; return triangles and flips."""
     cells, gone, flipped = cells.copy(), np.zeros(len(cells), bool), 0
     corners = vertices[cells]
     lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)

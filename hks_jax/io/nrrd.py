@@ -23,8 +23,7 @@ KINDS = {
     for masked in ("", "masked-")
     for symmetric in ("", "symmetric-")
 }
-"""The kinds of axes that hold tensor components, and their number of entries including the confidence."""
-
+"""For each kind of axis that contains the components of a tensor, the number of its entries, with any confidence."""
 
 _FIELDS = frozenset(
     name
@@ -43,7 +42,7 @@ _PATIENT = {
     "left-anterior-superior": (-1.0, 1.0, 1.0),
     "left-posterior-superior": (-1.0, -1.0, 1.0),
 }
-"""The patient-based spaces, and the signs that transform them to right, anterior, superior, NIfTI's axes."""
+"""The patient-based spaces, and the signs that transform their coordinates to NIfTI's: right, anterior, superior."""
 
 _SHORT = {"".join(word[0] for word in name.split("-")): name for name in _PATIENT}
 _SPACES = (*_PATIENT, "scanner-xyz", "3d-right-handed", "3d-left-handed")
@@ -59,7 +58,7 @@ class Placement(NamedTuple):
     origin: Float[np.ndarray, " d"]  # the position of voxel 0, in the file's space
     # The signs that transform the file's space to right, anterior, superior; None if it is not patient-based.
     signs: Float[np.ndarray, " d"] | None
-    measured: Float[np.ndarray, "m n"] | None  # the vectors of the measurement frame as columns
+    measured: Float[np.ndarray, "m n"] | None  # the vectors of the measurement frame as columns, or None
     placed: bool  # whether the file gives directions, and not only spacings
     unit: str  # the file's unit of length; empty if there is none
 
@@ -77,7 +76,7 @@ class Placement(NamedTuple):
 
 
 def load(name: str) -> tuple[np.ndarray, dict[str, Any]]:
-    """Return the header and the array in native byte order; its first axis is the fastest in the file."""
+    """Return the array in native byte order, with the fastest axis of the file first, and the header."""
     nrrd, file = optional("nrrd"), existing(name)
     with reading(file, "a readable NRRD file"), open(file, "rb") as stream, warnings.catch_warnings():
         warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)  # malformed text
@@ -92,9 +91,9 @@ def load(name: str) -> tuple[np.ndarray, dict[str, Any]]:
 
 
 def _check_header(text: bytes, header: Mapping[str, Any]) -> None:
-    """Raise ValueError for a line that is neither a field of the format nor a key, and for a field of wrong length.
+    """Raise ValueError for a header line that is neither a field nor a key, and for a field of wrong length.
 
-    Without this check, a field with a damaged name would be ignored and have its default, such as a spacing of one.
+    Without this check, a field with a damaged name would be ignored and have its default, such as a spacing of 1.
     """
     for line in text.splitlines()[1:]:
         if line.startswith(b"#") or not line:
@@ -111,7 +110,7 @@ def _check_header(text: bytes, header: Mapping[str, Any]) -> None:
 
 
 def _space_of(header: Mapping[str, Any]) -> str:
-    """Return the full name of the space in lower case, without its time axis, or the empty text."""
+    """Return the full name of the space in lower case, without its time axis, or the empty text if there is none."""
     space = str(header.get("space", "")).lower()
     name = _SHORT.get(space.removesuffix("t"), space.removesuffix("-time"))
     if "space" in header and name not in _SPACES:
@@ -120,7 +119,7 @@ def _space_of(header: Mapping[str, Any]) -> str:
 
 
 def _check_data(file: Path, header: Mapping[str, Any], start: int) -> None:
-    """Raise an error if compressed data are incomplete or fail their checksum; pynrrd compares the length of others."""
+    """Raise an error if compressed data are incomplete or fail their checksum; pynrrd checks the length of others."""
     opened = _OPENED.get(str(header["encoding"]).lower())
     if opened is None:
         return
@@ -134,7 +133,7 @@ def _check_data(file: Path, header: Mapping[str, Any], start: int) -> None:
 
 
 def _read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, Float[np.ndarray, "4 4"] | None]:
-    """Return voxel values and any affine; if the file has no unit, guess it from the related affine `beside`."""
+    """Return voxel values and any affine. If the file has no unit, guess it from the tensors' affine `beside`."""
     data, header = load(name)
     place = _placement(name, header, list(range(data.ndim)))
     affine = place.affine
@@ -282,7 +281,7 @@ def _placement(name: str, header: Mapping[str, Any], domain: list[int]) -> Place
 
 
 def _lengths(name: str, header: Mapping[str, Any], domain: list[int]) -> tuple[str, Float[np.ndarray, " d"]]:
-    """Return the file's unit of length, empty if there is none, and its length in mm along each axis."""
+    """Return the file's unit of length, or the empty text, and its size in mm for each axis."""
     field = "space units" if "space directions" in header else "units"
     listed = list(header.get(field, ()))
     given = listed[: len(domain)] if field == "space units" else [listed[axis] for axis in domain if listed]
@@ -298,13 +297,13 @@ def _lengths(name: str, header: Mapping[str, Any], domain: list[int]) -> tuple[s
 def _to_voxel_axes(
     name: str, tensors: Float[np.ndarray, "*shape d d"], frame: str | None, place: Placement, notes: list[str]
 ) -> tuple[Float[np.ndarray, "*shape d d"], str]:
-    """Return the tensors along the voxel axes, and the frame in which the file gives them."""
+    """Return the tensors with components along the voxel axes, and the frame of the components in the file."""
     d, directions, columns = tensors.shape[-1], place.directions, place.measured
     if columns is None:
         if frame == "measurement":
             raise ValueError(f'frame: got {frame!r}, but {name} has no measurement frame; expected "voxel" or "world"')
         rotation = nearest_rotation(directions)
-        # If all voxel axes have the directions of the space's axes, or all are reversed, both frames agree.
+        # If all voxel axes have the directions of the space's axes, or all are reversed, "voxel" and "world" agree.
         same = np.allclose(rotation, np.eye(d), atol=1e-6) or np.allclose(rotation, -np.eye(d), atol=1e-6)
         if frame is None and not same:
             raise ValueError(

@@ -37,7 +37,7 @@ _SAME, _TINY, _FILLED = 1e-6, 1e-6, 0.2
 
 
 def find_invalid(volume: TensorVolume, floor: float | None = None) -> Bool[np.ndarray, "*shape"]:
-    """Return the voxels inside whose tensor is not finite, not positive definite, or has an eigenvalue < `floor`.
+    """Return the voxels inside the mask whose tensor is not finite or has an eigenvalue that is ≤ 0 or < `floor`.
 
     Examples:
         >>> volume = hj.io.TensorVolume(np.array(field.tensors), (1.0, 1.0), (0.0, 0.0))
@@ -55,12 +55,12 @@ def find_invalid(volume: TensorVolume, floor: float | None = None) -> Bool[np.nd
 
 
 def find_unsymmetric(volume: TensorVolume) -> Bool[np.ndarray, "*shape"]:
-    """Return the voxels inside whose tensor is unsymmetric beyond rounding, as `hks_jax.TensorField` defines it."""
+    """Return the voxels inside the mask whose tensor is unsymmetric beyond rounding, as for `hks_jax.TensorField`."""
     return volume.inside & unsymmetric(volume.tensors)
 
 
 def require_valid(volume: TensorVolume, argument: str = "repair") -> None:
-    """Raise ValueError if tensors inside are not positive definite, with their number, the first one and remedies."""
+    """Raise ValueError with remedies if tensors inside the mask of a volume are not positive definite."""
     bad = find_invalid(volume)
     if bad.any():
         tensors = volume.tensors[bad]
@@ -165,7 +165,7 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
 
 
 def _why_so_many(volume: TensorVolume, finite: Float[np.ndarray, "n d d"]) -> str:
-    """Return a possible reason for many invalid tensors, such as a wrong order; `finite` holds their finite ones."""
+    """Return a possible reason for many invalid tensors, such as a wrong order; `finite` has the finite ones."""
     question = "" if volume.invalid_by_order is None else volume.invalid_by_order.question
     if question or not len(finite):
         return question or "Noise does not explain this number. Programs often write NaN outside a mask"
@@ -226,7 +226,7 @@ def find_background(volume: TensorVolume) -> tuple[Bool[np.ndarray, "*shape"], s
 
 
 def positive_tensors(volume: TensorVolume, how: PositiveMap, number: float) -> TensorVolume:
-    """Map all tensors S inside, such as stresses, to positive definite ones, and return the volume.
+    """Map all tensors S inside the mask, such as stresses, to positive definite ones, and return the volume.
 
     ``"exp"`` computes exp(S/number), and ``"shift"`` computes S + number·I, as `hks_jax.TensorField.from_indefinite`
     does. The mapped tensors are a metric, so continue with ``metric="tensor"``.

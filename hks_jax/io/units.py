@@ -32,7 +32,7 @@ _PREFIXES = {
     **{"": 1e3, "centi": 10.0, "c": 10.0, "milli": 1.0, "m": 1.0, "nano": 1e-6, "n": 1e-6},
     **dict.fromkeys(("micro", "u", "\u00b5", "\u03bc"), 1e-3),  # the micro sign, and the Greek letter
 }
-"""The length in mm of a metre with each prefix."""
+"""For each prefix of the metre, the length in mm of the unit with this prefix."""
 
 
 def millimetres(where: str, text: str) -> float | None:
@@ -52,9 +52,10 @@ def by_axis(values: Iterable[float]) -> str:
 
 
 def scaled_beside(own: Float[np.ndarray, "4 4"], affine: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """Convert to mm the affine `own` of an image without a unit of length, which belongs to an image with `affine`.
+    """Convert the affine `own` of a mask or of labels, which has no unit of length, to mm as in the image's `affine`.
 
-    Some programs lose the unit of masks and labels. The function chooses mm, m or µm for similar voxel sizes.
+    Some programs lose the unit of masks and labels. The function chooses mm, m or µm, whichever gives voxel sizes most
+    similar to the image's.
     """
     ratio = np.linalg.norm(affine[:3, :3]) / np.linalg.norm(own[:3, :3])
     scale = min((1.0, 1e3, 1e-3), key=lambda s: abs(math.log(ratio / s)))

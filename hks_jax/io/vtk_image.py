@@ -103,7 +103,7 @@ def _write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, An
 
 
 def by_time(name: str, array: np.ndarray, n: int, extra: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return `array` under its name if n = 0, or one array per time under names with the time if n = 1."""
+    """Return the array by its name if n = 0, or one array per time, with the time in its name, if n = 1."""
     if n == 0:
         return {name: array}
     times = np.ravel(extra.get("times", ()))
@@ -171,10 +171,10 @@ def _check_pieces(content: bytes) -> None:
 
 
 def _check_range(content: bytes, array: str, values: np.ndarray) -> None:
-    """Raise ValueError if the norms of an array's rows contradict the range that the file declares, if it does."""
+    """Raise ValueError if the file declares a range of the array that differs from the range of its rows' norms."""
     tag = re.search(rb"<DataArray\b[^>]*\bName=\"" + re.escape(array.encode()) + rb"\"[^>]*>", content)
     told = [float(word) for word in re.findall(rb"\bRangeM(?:in|ax)=\"([^\"]+)\"", tag[0])] if tag else []
-    if len(told) < 2 or np.isnan(values).any() or b"vtkGhostType" in content[:10_000]:  # the range omits ghosts
+    if len(told) < 2 or np.isnan(values).any() or b"vtkGhostType" in content[:10_000]:  # the range omits ghost values
         return
     with np.errstate(over="ignore"):
         lengths = np.linalg.norm(values, axis=-1)
@@ -197,7 +197,7 @@ def _check_length(content: bytes, array: str, values: np.ndarray) -> None:
 
 
 def _tensor_array(name: str, image: Mapping[str, np.ndarray], wanted: str | None) -> tuple[str, str, bool]:
-    """Return the place (point or cell) and the name of the array of tensors, and whether the file declares it so."""
+    """Return the place (point or cell) and name of the array to read, and whether the file declares it as tensors."""
     for place in ("point", "cell"):
         arrays = {key.partition(":")[2]: a for key, a in image.items() if key.startswith(f"{place}:")}
         tensors = [n for n, a in arrays.items() if a.ndim == 2 and a.shape[1] in (6, 9) and wanted in (None, n)]
@@ -212,7 +212,7 @@ def _tensor_array(name: str, image: Mapping[str, np.ndarray], wanted: str | None
     asked = "" if wanted is None else f" named {wanted!r}"
     raise ValueError(
         f"{name}: got the arrays (components) {listed}; expected one array of 6 or 9 components{asked}. Pass "
-        "array, the name of the one to read"
+        "array, the name of the array to read"
     )
 
 
@@ -222,7 +222,7 @@ def _on_grid(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _as_plane(volume: TensorVolume) -> TensorVolume:
-    """Return an image one voxel thick as a slice if its tensors vanish across the plane."""
+    """Return an image one voxel thick as a slice, if all components of its tensors across the plane are zero."""
     size = np.abs(volume.tensors).max()
     rounding = 100 * np.finfo(volume.tensors.dtype).eps * size  # from the rotation to voxel axes
     for axis in range(3):

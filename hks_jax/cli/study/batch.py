@@ -63,7 +63,7 @@ KEPT = f"""
     Automatic times are log-spaced over the range that suits all subjects, and the study keeps them
 """
 DEFAULTS = {option.name: None for option in options_in(KEPT) if option.name not in FILES}
-"""The options that a study keeps, without a default, so that omitted options are known."""
+"""The options that a study keeps, with the default None, by which omitted options are recognised."""
 OPTIONS = f"""
 subjects SUBJECTS  the table of subjects
 -o,--output DIR!  the study's folder
@@ -217,7 +217,7 @@ def _suitable(
 
 
 Range = tuple[float, float]
-"""The least and the largest time that suit a subject: voxels and eigenpairs limit the first, the size the second."""
+"""The least time that suits a subject, which voxels and eigenpairs limit, and the largest, which the size limits."""
 
 
 def suitable_range(volume: TensorVolume, args: argparse.Namespace) -> Range:

@@ -95,7 +95,7 @@ class Study:
     def write_signature(
         self, subject: Subject, fingerprint: str, result: Result, warnings: list[str], draw: Callable[[Path], Any]
     ) -> None:
-        """Write a subject's signature, its picture and, last, the sidecar that marks completion; no file has a date."""
+        """Write a subject's signature, its picture and, last, the sidecar that marks completion, all without dates."""
         self.forget(subject)
         args, report, scaled = subject.args, result.report, result.arrays.get("scaled_times")
         target = self.path(subject, MAP)

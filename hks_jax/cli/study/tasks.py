@@ -28,7 +28,7 @@ from hks_jax.signatures.times import positive_range
 from hks_jax.storage import claim
 
 FORGETFUL = 8
-"""The number of subjects after which compiled programs are deleted; each domain needs its own 70 MiB of programs."""
+"""The number of subjects after which compiled programs are deleted; each domain needs 70 MiB of new programs."""
 
 PATIENCE = 0.5
 """The seconds between two checks of subjects that other processes compute."""
@@ -112,7 +112,7 @@ class _Task(NamedTuple):
         return self.study.folder / self.subject.folder / ".attempt"
 
     def left(self) -> "_Task | None":
-        """Return the parts that are still missing, because another process may have done some, or None."""
+        """Return the parts that are still missing, or None if other processes have done them."""
         missing = self.signature and not self.study.has(self.subject, MAP, self.fingerprint)
         known = not missing and self.study.has(self.subject, REGIONS, self.regions)
         left = self._replace(signature=missing, regions="" if known else self.regions)
