@@ -8,7 +8,7 @@ examples:
   hks-jax hks --help
 """
 
-# This is the command line `hks-jax`. It reports an error as one line on stderr and as an exit code.
+# The command line reports an error as one line on stderr and as an exit code.
 
 import _thread
 import argparse
@@ -34,7 +34,7 @@ COMMANDS = (hks, spectrum, curvature, fit, batch, stats, plot, explore, info, co
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 
-# Errors that users can correct: wrong values, missing files, missing extras. Other errors mean a failed computation.
+# Users can correct these errors: wrong values, missing files, missing extras. Other errors mean a failed computation.
 INPUT_ERRORS = (ValueError, FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError, ImportError)
 
 

@@ -67,11 +67,6 @@ class Solved(NamedTuple):
         """The volume, with the domain as its mask."""
         return self.volume.with_mask(self.field.grid.mask)
 
-    @property
-    def described(self) -> dict[str, Any]:
-        """The entries of a report about the tensors."""
-        return describe_input(self.volume, self.field.grid.mask)
-
 
 def use_dtype(dtype: str) -> None:
     """Enable float64 in JAX if `dtype` is ``"float64"``; call it before arrays are created."""
@@ -95,7 +90,7 @@ def result_of(
 
 
 def automatic_times(pairs: hj.Eigenpairs, n: int) -> tuple[float, ...]:
-    """Return n default times; at the last, √t is about half the length of the domain."""
+    """Return n default times; at the last time, √t is about half the length of the domain."""
     return tuple(np.asarray(hj.default_times(pairs, n, math.exp(-LAST)), np.float64).tolist())
 
 
@@ -166,8 +161,8 @@ def _report(settings: Settings, pairs: hj.Eigenpairs, times: tuple[float, ...]) 
     }
 
 
-def describe_input(volume: TensorVolume, mask: np.ndarray | None) -> dict[str, Any]:
-    """Return the entries of a report about the tensors, where `mask` is the domain."""
+def describe_input(volume: TensorVolume) -> dict[str, Any]:
+    """Return the entries of a report about the tensors of a volume, whose mask is the domain."""
     about = {name: getattr(volume, name) for name in ("shape", "spacing", "length_unit", "unit")}
     return {
         "source": volume.source,
@@ -176,7 +171,7 @@ def describe_input(volume: TensorVolume, mask: np.ndarray | None) -> dict[str, A
         "median_mean_diffusivity": median_mean_diffusivity(volume),
         "order": volume.order,
         "frame": volume.frame,
-        "voxels_inside": int(np.prod(volume.shape) if mask is None else mask.sum()),
+        "voxels_inside": int(volume.inside.sum()),
         "notes": list(volume.notes),
         "repair": dict(volume.repair) or None,
     }

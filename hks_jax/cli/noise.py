@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import hks_jax as hj
-from hks_jax.cli.job import Settings, Solved, automatic_times, result_of
+from hks_jax.cli.job import Settings, Solved, automatic_times, describe_input, result_of
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read_volume
 from hks_jax.cli.values import Times
@@ -61,7 +61,7 @@ def second_scan(args: argparse.Namespace) -> argparse.Namespace | None:
 def signature_of(args: argparse.Namespace, solved: Solved, progress: Progress) -> Result:
     """Compute the signature of a volume or slice from its eigenpairs, with error bars if ``--noise`` is given."""
     volume, field, pairs, settings = solved
-    of_pairs = partial(result_of, solved.domain, solved.described, pairs)
+    of_pairs = partial(result_of, solved.domain, describe_input(solved.domain), pairs)
     if getattr(args, "noise", None) is None:
         return of_pairs(settings, progress)
 
@@ -123,8 +123,8 @@ def _error_bars(
     """Return error bars, the sampled noise (n_draws, n_times, *shape), the interior (n_times, *shape), and the times.
 
     For the boundary ``"mean"``, the interior contains the nodes with little influence of the boundary, and is empty at
-    times with few such nodes. For other boundaries, it is the whole domain. Automatic times begin at the first with a
-    sufficient signal-to-noise ratio.
+    times with few such nodes. For other boundaries, it is the whole domain. Automatic times begin at the first
+    time with a sufficient signal-to-noise ratio.
     """
     wanted = settings.times.automatic
     times = settings.times.explicit or automatic_times(pairs, _CANDIDATES * wanted)

@@ -1,6 +1,6 @@
 """The table of all options, which defines the parsers, the settings, the columns of studies and the reference page.
 
-A line of the table defines an option: its flags, its value, its default, and after two spaces its help text, which
+A line of the table defines an option by its flags, its value, its default and, after two spaces, its help text, which
 indented lines continue. ``N...`` means one or more values, ``N!`` a required value, and ``a|b`` a choice. An option
 without a value is a switch. A line ``[name] title: text`` begins a section, and ``@name`` includes a section in the
 options of a command (`OPTIONS` in its module).

@@ -26,7 +26,7 @@ _OPTIONAL = ("nibabel", "dipy", "pynrrd", "vtk", "meshio")
 
 
 class Done(NamedTuple):
-    """The output of a command: the names of its files, or a text in place of the names, and a summary for JSON."""
+    """The output of a command: its files, a summary for JSON, and a text to print in place of the files' names."""
 
     files: list[Path]
     summary: dict[str, Any]
@@ -46,9 +46,9 @@ def show(args: argparse.Namespace, done: Done) -> None:
 def writing(
     folder: Path, report: Mapping[str, Any], progress: Progress, stale: Callable[[], Iterable[Path]] = tuple
 ) -> Iterator[tuple[Path, Done]]:
-    """Yield a temporary folder, and a `Done` to which the report and the paths of the results are added at the end.
+    """Yield a temporary folder and a `Done`; the report and the paths of the results are added to it at the end.
 
-    At the end, report.json is written, all files are moved to `folder` atomically, and the `stale` files are deleted.
+    Then report.json is also written, all files are moved to `folder` atomically, and the `stale` files are deleted.
     """
     done = Done([], {})
     with progress.stage("writing", str(folder)), atomic_folder(folder, stale) as temporary:

@@ -1,4 +1,4 @@
-"""Write and read eigenpairs together with their field, for ``hks-jax hks --save-pairs`` and ``hks-jax hks PAIRS``."""
+"""Write and read eigenpairs with their tensors, for ``hks-jax hks --save-pairs`` and ``hks-jax hks PAIRS``."""
 
 import json
 import zipfile
@@ -14,7 +14,7 @@ from hks_jax.cli.job import Settings, Solved, field_of
 from hks_jax.cli.progress import Progress
 from hks_jax.io.arrays import place_of, volume_of
 from hks_jax.io.pairs import pairs_of, save_pairs
-from hks_jax.io.result import plain, recorded_boundary
+from hks_jax.io.result import plain, tuples
 from hks_jax.storage import load_npz
 
 _RECORD = "field_record"
@@ -33,7 +33,7 @@ def arrays_in(path: Path) -> set[str]:
 
 
 def is_saved_pairs(path: Path) -> bool:
-    """Return whether a file contains eigenpairs with their field."""
+    """Return whether a file contains eigenpairs with their tensors."""
     return _RECORD in arrays_in(path)
 
 
@@ -63,8 +63,7 @@ def read_pairs(path: Path, settings: Settings, progress: Progress) -> tuple[Solv
     record: dict[str, Any] = json.loads(str(arrays[_RECORD]))
     about = {name: record[name] for name in _ABOUT if name in record} | {"notes": tuple(record["notes"])}
     volume = volume_of(str(path), arrays, arrays["tensors"], **about)
-    boundary = recorded_boundary(record["settings"])
-    assert boundary is not None
+    boundary = tuples(record["settings"]["boundary"])
     settings = replace(settings, **{**record["settings"], "boundary": boundary})
     for warning in record["warnings"]:
         progress.warn(warning)

@@ -56,7 +56,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
 
 
 def names_of(labels: Path, names: Path | None) -> tuple[Path | None, dict[int, str]]:
-    """Return the names of labels and their file, which is `names` or the table beside the labels."""
+    """Return the file with the names of labels (`names`, or the table beside the labels), and the names."""
     beside = names or names_beside(labels)
     return (None, {}) if beside is None else (Path(beside), read_names(beside))
 

@@ -19,11 +19,11 @@ from hks_jax.storage import reading
 _TRIANGLES = b"\xff\xff\xfe"
 """The first bytes of FreeSurfer's files of triangles."""
 _AXES = 6
-"""The largest number of axes of an array in GIFTI."""
+"""The largest number of axes that GIFTI allows for an array."""
 
 
 def is_freesurfer(path: Path) -> bool:
-    """Return whether a file begins as FreeSurfer's surfaces do."""
+    """Return whether a file begins with the first bytes of FreeSurfer's surfaces."""
     if not path.is_file():
         return False
     with open(path, "rb") as stream:
@@ -37,7 +37,7 @@ _SCANNER = (1, 2)
 
 
 def load_freesurfer(path: Path, in_space: bool = False) -> Loaded:
-    """Load a FreeSurfer surface, with coordinates in mm as in the file or, if `in_space`, the scanner's."""
+    """Load a FreeSurfer surface with the coordinates in the file or, if `in_space`, with scanner coordinates, in mm."""
     library = optional("nibabel")
     with reading(path, "a readable FreeSurfer surface"):
         content = path.read_bytes()
@@ -72,11 +72,11 @@ def _from_own_axes(path: Path, vertices: np.ndarray, axes: list[np.ndarray | Non
 
 
 def load_gifti(path: Path, in_space: bool = False) -> Loaded:
-    """Load a GIFTI surface, with coordinates as in the file or, if `in_space`, the scanner's."""
+    """Load a GIFTI surface with the coordinates in the file or, if `in_space`, with scanner coordinates."""
     library = optional("nibabel")
     with reading(path, "a readable GIFTI surface"):
         content = gzip.decompress(path.read_bytes()) if path.suffix.lower() == ".gz" else path.read_bytes()
-        # nibabel loops over the declared number of axes, however large.
+        # nibabel would loop over any declared number of axes, such as a billion.
         axes = [int(n) for n in re.findall(rb"Dimensionality\s*=\s*[\"'](\d+)", content)]
         if max(axes, default=0) > _AXES:
             raise ValueError(f"got an array of {max(axes)} axes; expected at most {_AXES}")

@@ -46,11 +46,11 @@ def read_tensors(
       declares the order, and the sidecar may declare the frame. The tensors may also be in six images of one component
       each; give the path of one of them, or all six.
     - MRtrix: an image (nx, ny, nz, 6), as dwi2tensor writes it.
-    - NRRD: any axis may hold the components. Its kind is one of the format's 2D or 3D matrices, or the axis has six
+    - NRRD: any axis may hold the components. Its kind is one of NRRD's 2D or 3D matrices, or the axis has six
       components (three in the plane) and `order` is given. The measurement frame is applied. If the file's space is
       patient-based, the affine's axes are right, anterior, superior.
     - VTK (``.vti``, structured points in ``.vtk``): tensors of nine or six components at points or cells, and an
-      optional array ``mask``. An image one voxel thick whose tensors vanish across it gives 2×2 tensors.
+      optional array ``mask``. An image one voxel thick gives 2×2 tensors if the components across it are zero.
     - npz: the array ``tensors`` (nx, ny, 2, 2) or (nx, ny, nz, 3, 3), where array axis a runs along coordinate a,
       or with six components (three in the plane) if `order` is given. Optional arrays are ``spacing`` (d,) = 1,
       ``origin`` (d,) = 0, ``mask`` (*shape,), ``affine`` (4, 4), ``order`` and ``frame``. npy: only the tensors.
@@ -101,7 +101,7 @@ def read_tensors(
             raise ValueError(f"spacing: {name} declares its spacing; only NumPy's files may lack it. Leave it out")
         given = {"array": array, "spacing": spacing, "confidence": confidence}
         volume = reader.read_tensors(name, order, frame, **{option: given[option] for option in reader.options})
-        if not name.lower().endswith(".nhdr"):  # a detached header does not identify the data file
+        if not name.lower().endswith(".nhdr"):  # the digest of a detached header would not identify the data
             volume = replace(volume, digest=digest(name))
     if unit is not None:
         volume = in_mm2_per_s(volume, unit)
@@ -132,7 +132,7 @@ def save(
     - ``.vtu``, ``.vtk``, ``.msh`` (Gmsh), and for triangles ``.ply``: the mesh and one array per time.
 
     Every file contains a JSON record of its origin: the version, the tensors' file with its SHA-256, order and frame,
-    the decisions of the reader, and `provenance`. For a mesh not in npz, the record is in a second file, whose path is
+    the notes about its reading, and `provenance`. For a mesh not in npz, the record is in a second file, whose path is
     `path` with ``.json`` appended. Files are written atomically.
 
     Args:

@@ -63,7 +63,7 @@ _COUNTS = {
 """Patterns of the declared numbers of points and cells in each format. For .stl, meshio compares the length itself."""
 
 _PLY = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
-"""The size in bytes of types in .ply that have other names in NumPy."""
+"""The size in bytes of those types in .ply that have another name in NumPy."""
 
 
 def _declared(content: bytes, suffix: str) -> tuple[int, ...]:
@@ -99,7 +99,7 @@ def _compare_ply(content: bytes, mesh: Any) -> None:
     of_points, _, of_cells = head.partition(b"element face")
     lists = re.findall(rb"property\s+list\s+(\w+)\s+(\w+)", of_cells)
     if len(lists) != 1:
-        return  # with other lists, the file declares no total length
+        return  # with other lists, the length of the cells is unknown
 
     def size(name: bytes) -> int:
         return 1 if ascii_ else _PLY.get(name.decode()) or np.dtype(name.decode()).itemsize
@@ -252,7 +252,7 @@ def load_off(file: Path) -> Loaded:
         for row, corners in zip(rows[n_vertices:], polygons, strict=True):
             # A colour may follow the corners, as an index or as three or four numbers.
             if len(corners) != int(row[0]) or len(corners) < 3 or len(row) - 1 - len(corners) > 4:
-                raise ValueError(f"got the face {' '.join(row)[:60]}; expected n, n corners and at most a colour")
+                raise ValueError(f"got the face {' '.join(row)[:60]}; expected n, n corners, an optional colour")
     return _triangulated(file, vertices, polygons)
 
 

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from hks_jax.checks import require_real
 from hks_jax.io.questions import OPEN_FRAME
 from hks_jax.io.repair import require_symmetric
 from hks_jax.io.tables import write_json
@@ -60,7 +59,6 @@ def voxels(name: str, image: Any) -> np.ndarray:
     """Return the voxel values of a loaded image after its scaling, in float32 if they are stored so, or in float64."""
     with reading(name, "a readable NIfTI image"):
         data = np.asarray(image.dataobj)
-    require_real(name, data)
     if data.dtype.kind not in "fiub":
         raise ValueError(f"{name}: got voxels of type {data.dtype}; expected real numbers")
     dtype = data.dtype if data.dtype.kind == "f" and data.dtype.itemsize in (4, 8) else np.dtype(np.float64)
@@ -185,7 +183,7 @@ def read_components(paths: Sequence[str], order: str | None, frame: str | None) 
     """Read tensors from six images in any sequence; each file's name states its component.
 
     If `frame` is None, the BIDS sidecar of the image of xx gives the axes of the components (``Reference`` in
-    ``OrientationEncoding``). Without a sidecar, they are the voxel axes.
+    ``OrientationEncoding``). Without a sidecar, the components are along the voxel axes.
     """
     if order is not None:
         raise ValueError(f"order: got {order!r}, but the names of six images state their components. Leave it out")

@@ -25,15 +25,11 @@ KINDS = {
 }
 """For each kind of axis that contains the components of a tensor, the number of its entries, with any confidence."""
 
-_FIELDS = frozenset(
-    name
-    for names in (
-        "dimension, type, block size, blocksize, encoding, endian, content, min, max, old min, oldmin, old max, oldmax",
-        "data file, datafile, line skip, lineskip, byte skip, byteskip, number, sample units, sampleunits, sizes",
-        "spacings, thicknesses, axis mins, axismins, axis maxs, axismaxs, centers, centerings, labels, units, kinds",
-        "space, space dimension, space units, space origin, space directions, measurement frame",
-    )
-    for name in names.split(", ")
+_FIELDS = (
+    "dimension, type, block size, blocksize, encoding, endian, content, min, max, old min, oldmin, old max, oldmax, "
+    "data file, datafile, line skip, lineskip, byte skip, byteskip, number, sample units, sampleunits, sizes, "
+    "spacings, thicknesses, axis mins, axismins, axis maxs, axismaxs, centers, centerings, labels, units, kinds, "
+    "space, space dimension, space units, space origin, space directions, measurement frame"
 )
 """All fields of the format (Teem, "Definition of NRRD File Format")."""
 
@@ -52,15 +48,23 @@ _OPENED: dict[str, Any] = {"gzip": gzip.open, "gz": gzip.open, "bzip2": bz2.open
 
 
 class Placement(NamedTuple):
-    """The position of the voxels, in mm if the file declares a unit."""
+    """The position of the voxels, in mm if the file declares a unit.
 
-    directions: Float[np.ndarray, "d d"]  # column a is the step along voxel axis a, in the file's space
-    origin: Float[np.ndarray, " d"]  # the position of voxel 0, in the file's space
-    # The signs that transform the file's space to right, anterior, superior; None if it is not patient-based.
+    Attributes:
+        directions: column a is the step along voxel axis a, in the file's space.
+        origin: the position of voxel 0, in the file's space.
+        signs: the signs that transform the file's space to right, anterior, superior; None if it is not patient-based.
+        measured: the vectors of the measurement frame as columns, or None.
+        placed: whether the file gives directions, and not only spacings.
+        unit: the file's unit of length; empty if there is none.
+    """
+
+    directions: Float[np.ndarray, "d d"]
+    origin: Float[np.ndarray, " d"]
     signs: Float[np.ndarray, " d"] | None
-    measured: Float[np.ndarray, "m n"] | None  # the vectors of the measurement frame as columns, or None
-    placed: bool  # whether the file gives directions, and not only spacings
-    unit: str  # the file's unit of length; empty if there is none
+    measured: Float[np.ndarray, "m n"] | None
+    placed: bool
+    unit: str
 
     @property
     def affine(self) -> Float[np.ndarray, "4 4"] | None:
@@ -100,7 +104,7 @@ def _check_header(text: bytes, header: Mapping[str, Any]) -> None:
             continue
         key, colon, value = line.partition(b":")
         name, is_key = key.decode("latin-1"), value.startswith(b"=")
-        if not colon or (name in _FIELDS) == is_key or (not is_key and not line.isascii()) or b"\0" in line:
+        if not colon or (name in _FIELDS.split(", ")) == is_key or (not is_key and not line.isascii()) or b"\0" in line:
             raise ValueError(f"got the header line {line[:60]!r}; expected a field of the format, or a key and a value")
     n = int(header["dimension"])
     for name in _PER_AXIS:
@@ -119,7 +123,7 @@ def _space_of(header: Mapping[str, Any]) -> str:
 
 
 def _check_data(file: Path, header: Mapping[str, Any], start: int) -> None:
-    """Raise an error if compressed data are incomplete or fail their checksum; pynrrd checks the length of others."""
+    """Raise an error if compressed data are incomplete or fail their checksum; pynrrd checks uncompressed ones."""
     opened = _OPENED.get(str(header["encoding"]).lower())
     if opened is None:
         return

@@ -36,7 +36,7 @@ class Alternative(NamedTuple):
 
 
 class Coherence(NamedTuple):
-    """How well fibres of neighbouring voxels line up, in the frame of the file and along alternative axes."""
+    """The alignment of fibres in neighbouring voxels, in the frame of the file and along alternative axes."""
 
     frame: str  # the frame in which the file was read
     angle: float  # the mean angle, in degrees, between a principal direction and the mean direction of its neighbours
@@ -133,7 +133,7 @@ def _angles(
     """Return the angle, in degrees, between each direction and the mean direction of its two neighbours, or NaN.
 
     Along a curved fibre, the directions at the two neighbours deviate to opposite sides, and the mean cancels this. A
-    single neighbour would not: circular fibres around a heart would then seem to line up best along radii.
+    single neighbour would not suffice: circular fibres around a heart would then seem to line up best along radii.
     """
     steps = directions / spacing
     steps = np.rint(steps / np.abs(steps).max(axis=1, keepdims=True)).astype(int)
@@ -178,7 +178,7 @@ def questions(volume: TensorVolume) -> tuple[str, ...]:
 
     Reflected or rotated tensors are still positive definite, but fibres of neighbouring voxels do not line up. The
     function therefore computes the mean angle between a principal direction and those of the two neighbours along it,
-    and compares the angle for several frames. This needs about a thousand anisotropic voxels; set the mask first.
+    and compares the angle for several frames. The comparison needs about 1000 anisotropic voxels; set the mask first.
 
     If lengths are in mm, the function also checks that the size of the voxels is usual for scans, and that the median
     mean diffusivity occurs in living tissue. For a slice, only the units are checked.

@@ -14,7 +14,6 @@ from jaxtyping import Float
 from hks_jax import Grid, SurfaceMesh, TetMesh
 from hks_jax.arrays import describe_array
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
-from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.io.arrays import volume_of
 from hks_jax.io.files import save
 from hks_jax.io.units import median_mean_diffusivity
@@ -210,12 +209,6 @@ class Result:
 def signature_file(result: Path) -> Path:
     """Return the path of the signature in a folder that ``hks-jax hks`` wrote; return any other path unchanged."""
     return result / "hks.npz" if result.is_dir() else result
-
-
-def recorded_boundary(settings: Mapping[str, Any]) -> BoundarySpec | None:
-    """Return the boundary in settings from JSON, with tuples in place of lists, or None."""
-    boundary: BoundarySpec | None = tuples(settings.get("boundary"))
-    return boundary
 
 
 def tuples(value: Any) -> Any:

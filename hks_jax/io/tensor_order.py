@@ -89,7 +89,7 @@ _SAMPLE = 20_000
 
 
 class InvalidByOrder(NamedTuple):
-    """For each order of components, the number of a file's tensors that would not be positive definite."""
+    """The number of a file's tensors that would not be positive definite in each order of components."""
 
     order: str  # the order in which the tensors were read
     counts: dict[str, int]  # the number of invalid tensors for each order

@@ -4,7 +4,7 @@ import math
 import re
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -52,7 +52,7 @@ def by_axis(values: Iterable[float]) -> str:
 
 
 def scaled_beside(own: Float[np.ndarray, "4 4"], affine: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """Convert the affine `own` of a mask or of labels, which has no unit of length, to mm as in the image's `affine`.
+    """Convert the affine `own` of a mask or labels without a unit of length to mm, by comparison with the image's.
 
     Some programs lose the unit of masks and labels. The function chooses mm, m or µm, whichever gives voxel sizes most
     similar to the image's.
@@ -64,7 +64,7 @@ def scaled_beside(own: Float[np.ndarray, "4 4"], affine: Float[np.ndarray, "4 4"
 
 def in_mm2_per_s(volume: TensorVolume, unit: Unit) -> TensorVolume:
     """Return the volume with its tensors converted from `unit` to mm²/s."""
-    if unit not in get_args(Unit):
+    if unit not in UNITS:
         raise ValueError(f"unit: got {unit!r}; expected one of {', '.join(UNITS)}")
     if volume.unit:
         raise ValueError(f"unit: got {unit!r}, but {volume.source} declares {volume.unit}. Leave this argument out")
@@ -76,7 +76,7 @@ def in_mm2_per_s(volume: TensorVolume, unit: Unit) -> TensorVolume:
 
 
 def length_question(volume: TensorVolume) -> str:
-    """Return a question if no scan has voxels of this size in mm, or else the empty text."""
+    """Return a question if lengths are in mm and no scan has voxels of this size, or else the empty text."""
     low, high = _VOXELS
     if volume.length_unit != "mm" or all(low <= h <= high for h in volume.spacing):
         return ""

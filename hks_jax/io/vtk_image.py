@@ -21,9 +21,9 @@ from hks_jax.optional import optional
 from hks_jax.storage import atomic_path, existing, load_npz, reading
 
 _ROOM, _RATIO = 8 << 30, 200
-"""The limit of memory for reading a file, in bytes, and its increase per byte of the file."""
+"""The limit of memory for reading an empty file, in bytes, and the increase of the limit per byte of a file."""
 _PATIENCE, _SPEED = 60.0, 1e6
-"""The limit of time for reading a file, in seconds, and the bytes of the file that add one second."""
+"""The limit of time for reading an empty file, in seconds, and the number of bytes that increase it by 1 s."""
 
 
 def holds_dataset(path: str | os.PathLike[str], kind: str) -> bool:
@@ -190,7 +190,7 @@ def _check_length(content: bytes, array: str, values: np.ndarray) -> None:
     key = re.escape(quote(array).encode())
     line = re.search(rb"\n(?:(?:TENSORS6?|SCALARS) " + key + rb" \w+.*|" + key + rb" \d+ \d+ \w+.*)\n", content)
     if line is None:
-        return  # the array's start is not found, because its name is written differently
+        return  # the array is not found, because its name is written differently
     rest, text = content[line.end() :], b"ASCII" in content.split(maxsplit=40)[:40]
     if len(rest.split(maxsplit=values.size)) < values.size if text else len(rest) < values.nbytes:
         raise ValueError(f"the file ends before the end of the array {array!r}; expected {values.size} values")

@@ -17,11 +17,12 @@ from hks_jax.cli.job import ComputationError, Solved, compute_pairs
 from hks_jax.cli.noise import signature_of
 from hks_jax.cli.pairs import are_of, read_pairs, write_pairs
 from hks_jax.cli.progress import StudyProgress
-from hks_jax.cli.reading import image_suffix, read_volume
+from hks_jax.cli.reading import read_volume
 from hks_jax.cli.stats import region_table
 from hks_jax.cli.study.folder import MAP, PAIRS, REGIONS, Study
 from hks_jax.cli.study.subjects import Subject
 from hks_jax.cli.values import Times
+from hks_jax.io.formats import format_of
 from hks_jax.io.tables import write_table
 from hks_jax.plot import signature_panels
 from hks_jax.signatures.times import positive_range
@@ -56,7 +57,7 @@ def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debu
         except Exception as error:
             failed(subject, error)
     pending = [task for task in plan if task.signature or task.regions]
-    # A subject that ended an earlier process, perhaps by lack of memory, may do so again, so it comes last.
+    # If a subject ended an earlier process, perhaps by lack of memory, it may do so again, so it comes last.
     pending.sort(key=lambda task: task.attempt.exists())
     if len(pending) < len(plan):
         progress.end(f"{len(plan) - len(pending)} of {len(subjects)} subjects are already done")
@@ -100,7 +101,7 @@ class _Task(NamedTuple):
 
     @classmethod
     def of(cls, study: Study, subject: Subject) -> "_Task":
-        """Return a task with the parts that are missing or have another fingerprint."""
+        """Return the task for a subject, with the parts whose files are missing or have another fingerprint."""
         fingerprint = study.fingerprint(subject)
         regions = "" if subject.args.atlas is None else study.regions_fingerprint(subject, fingerprint)
         task = cls(study, subject, fingerprint, True, regions)
@@ -159,5 +160,5 @@ def _pairs(study: Study, subject: Subject, progress: StudyProgress) -> Solved:
     solved = compute_pairs(read_volume(subject.args, progress), study.settings, progress)
     if study.save_pairs:
         with progress.stage("writing"):
-            write_pairs(kept, solved, image_suffix(subject.args.file), progress.warnings, fingerprint)
+            write_pairs(kept, solved, format_of(subject.args.file).image, progress.warnings, fingerprint)
     return solved
