@@ -55,17 +55,12 @@ class Settings:
 
 
 class Solved(NamedTuple):
-    """The eigenpairs of a volume or slice, its metric, and the settings, whose boundary is not None."""
+    """The eigenpairs of a volume or slice, whose mask is the domain, its metric, and settings with a boundary."""
 
     volume: TensorVolume
     field: hj.TensorField
     pairs: hj.Eigenpairs
     settings: Settings
-
-    @property
-    def domain(self) -> TensorVolume:
-        """The volume, with the domain as its mask."""
-        return self.volume.with_mask(self.field.grid.mask)
 
 
 def use_dtype(dtype: str) -> None:
@@ -113,7 +108,8 @@ def compute_pairs(volume: TensorVolume, settings: Settings, progress: Progress) 
             progress.warn(message)
         field = field_of(volume, grid, settings)
         pencil = hj.assemble(field, boundary)
-    return Solved(volume, field, solve(pencil, settings, progress), replace(settings, boundary=boundary))
+    pairs = solve(pencil, settings, progress)
+    return Solved(volume.with_mask(grid.mask), field, pairs, replace(settings, boundary=boundary))
 
 
 def solve(pencil: hj.Pencil | hj.MirrorPencil, settings: Settings, progress: Progress) -> hj.Eigenpairs:

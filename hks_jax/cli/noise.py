@@ -61,7 +61,7 @@ def second_scan(args: argparse.Namespace) -> argparse.Namespace | None:
 def signature_of(args: argparse.Namespace, solved: Solved, progress: Progress) -> Result:
     """Compute the signature of a volume or slice from its eigenpairs, with error bars if ``--noise`` is given."""
     volume, field, pairs, settings = solved
-    of_pairs = partial(result_of, solved.domain, describe_input(solved.domain), pairs)
+    of_pairs = partial(result_of, volume, describe_input(volume), pairs)
     if getattr(args, "noise", None) is None:
         return of_pairs(settings, progress)
 

@@ -42,7 +42,7 @@ def write_pairs(path: Path, solved: Solved, image: str, warnings: Sequence[str],
 
     The file also contains the suffix of images, the warnings, and the fingerprint of a study's subject.
     """
-    volume, settings = solved.domain, asdict(solved.settings)
+    volume, settings = solved.volume, asdict(solved.settings)
     record = {name: getattr(volume, name) for name in _ABOUT}
     record |= {"image": image, "warnings": warnings, "fingerprint": fingerprint}
     record["settings"] = {name: settings[name] for name in settings if name in _SETTLED}

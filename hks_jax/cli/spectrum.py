@@ -44,7 +44,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     }
     left_out = ("times", "normalisation", "method")
     report = {
-        "input": describe_input(solved.domain),
+        "input": describe_input(solved.volume),
         "settings": {name: value for name, value in asdict(solved.settings).items() if name not in left_out}
         | {"k": pairs.k},
         "eigenpairs": describe_pairs(pairs),

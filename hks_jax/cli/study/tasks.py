@@ -143,7 +143,7 @@ def _compute(study: Study, subject: Subject, fingerprint: str, progress: StudyPr
         solved = solved._replace(settings=replace(solved.settings, times=Times(tuple(own.tolist()), 0)))
     if args.noise == "residuals" and solved.volume.covariance is None:  # not saved with eigenpairs
         volume = read_volume(args, StudyProgress(1, quiet=True, stream=io.StringIO()))
-        solved = solved._replace(volume=volume)
+        solved = solved._replace(volume=volume.with_mask(solved.volume.mask))
     result = signature_of(args, solved, progress)
     result = replace(result, arrays={**scaled, **result.arrays})
     drawing = partial(signature_panels, result, view=args.view)
