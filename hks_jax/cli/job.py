@@ -48,14 +48,14 @@ class Settings:
 
     @classmethod
     def of(cls, args: argparse.Namespace | None = None, **given: Any) -> "Settings":
-        """Return the settings in `args`, or the default settings, with the settings in `given` in place of some."""
+        """Return the settings in `args`, or else the default settings; settings in `given` replace some of them."""
         chosen = vars(defaults(f"@metric {SOLVING} @signature")) | (vars(args) if args else {})
         given = {"metric": chosen["metric"] or "tensor", "times": parse_times(chosen["times"]), **given}
         return cls(**{field.name: chosen[field.name] for field in fields(cls)} | given)
 
 
 class Solved(NamedTuple):
-    """The eigenpairs of a volume or slice, whose mask is the domain, its metric, and settings with a boundary."""
+    """The eigenpairs and the metric of a volume whose mask is the domain, and settings whose boundary is not None."""
 
     volume: TensorVolume
     field: hj.TensorField

@@ -37,7 +37,7 @@ file FILE...
 --slice AXIS=N  one slice, such as z=14, instead of the volume
 --mask FILE  zeros and ones in NIfTI, MRtrix, NRRD, .npy, or in the array 'mask' of an .npz
 --background outside|inside
-    the treatment, without --mask, of voxels that a program filled with equal isotropic tensors or tensors near zero:
+    without --mask, whether voxels that a program filled with equal isotropic tensors, or with tensors near zero, are
     outside or inside the domain (default: inside, with a warning; zero tensors are always outside)
 --erode N = 0  remove N layers of voxels from the boundary of the mask
 [numbers] meaning of the numbers: needed only if the file does not declare it. Wrong axes mirror the tensors.
@@ -53,12 +53,13 @@ file FILE...
 --confidence C = 0.5  confidence above which voxels of NRRD's masked tensors are inside
 [invalid] tensors that are not positive definite: by default, they raise an error
 --repair HOW[:FLOOR]
-    repair of a few tensors: clip raises their eigenvalues to FLOOR (1 % of the median mean eigenvalue), mask leaves
-    their voxels out, nearest uses the nearest valid tensor. With FLOOR, tensors with a smaller eigenvalue are repaired
+    repair of a few tensors: clip raises their eigenvalues to FLOOR (default: 1 % of the median of mean eigenvalues),
+    mask leaves their voxels out, nearest uses the nearest valid tensor. With FLOOR, tensors with an eigenvalue below
+    FLOOR are also repaired
 --positive HOW:NUMBER
     map for tensors T that are naturally indefinite, such as stress: exp:S uses exp(T/S) and shift:C uses T + C·I as the
     metric; combine it with --metric tensor
-[dwi] diffusion-weighted images: DIPY fits the tensors. Without --mask, its median_otsu finds the brain.
+[dwi] diffusion-weighted images: DIPY fits the tensors. Without --mask, DIPY's median_otsu finds the brain.
 --bval FILE  b-values, in s/mm2 unless --unit is given
 --bvec FILE
     gradient directions of length 1 in three rows or three columns, as dcm2niix writes them (see --bvec-frame)

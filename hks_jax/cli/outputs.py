@@ -7,7 +7,7 @@ import platform
 import sys
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -92,8 +92,6 @@ def versions() -> dict[str, str]:
     python, system, device = platform.python_version(), platform.platform(), jax.devices()[0].device_kind
     versions = {"python": python, "system": system, "device": device}
     for package in ("hks-jax", "jax", "jaxlib", "optimistix", "numpy", "scipy", "matplotlib", *_OPTIONAL):
-        try:
+        with suppress(importlib.metadata.PackageNotFoundError):
             versions[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            continue
     return versions

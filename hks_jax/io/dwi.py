@@ -160,7 +160,7 @@ def fit_dwi(
 # the number of unknowns (Koay, Chang, Pierpaoli and Basser 2007).
 # The residual rₙ of the signal of image n changes β by (XᵀW²X)⁻¹ Xₙ wₙ rₙ. It has the variance σ²(1 − h), where
 # h = wₙ² Xₙᵀ(XᵀW²X)⁻¹Xₙ, so rₙ/√(1 − h) has the variance of the noise (MacKinnon and White 1985, HC2). Samples of the
-# noise draw one random sign for each image, which preserves correlations of the noise between voxels.
+# noise draw one random factor for each image, which preserves correlations of the noise between voxels.
 def _covariance(
     signal: Float[np.ndarray, "nx ny nz n"],
     inside: Bool[np.ndarray, "nx ny nz"],

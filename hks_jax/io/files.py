@@ -182,8 +182,8 @@ def save_tensors(
     - ``.nii``, ``.nii.gz``: a symmetric-matrix image (nx, ny, nz, 1, 6) with xx xy yy xz yz zz along the voxel axes.
       The tensors are zero outside the mask. Slices cannot be written.
     - ``.nrrd``: masked symmetric matrices, 3D or 2D, with the measurement frame, without the position of a slice.
-    - ``.vti``: nine components at the points, along the axes of space, and the mask. A slice gets
-      zeros for the components across its plane.
+    - ``.vti``: nine components at the points, along the axes of space, and the mask. A slice gets zeros for the
+      components across its plane.
     - ``.npz``: the arrays that `read_tensors` documents.
 
     The file contains the record that `save` describes, and the order and frame of the tensors, so `read_tensors` needs

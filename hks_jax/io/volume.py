@@ -46,8 +46,8 @@ class TensorVolume:
         spacing: the distance between voxels along each axis.
         origin: the coordinates of voxel (0, …, 0) on the grid; the affine gives its position in space.
         mask: bool (*shape), or None for all voxels.
-        affine: (4, 4), the map from voxel indices to world coordinates, or None. A slice has
-            the affine of a volume one voxel thick.
+        affine: (4, 4), the map from voxel indices to world coordinates, or None. A slice has the affine of a volume one
+            voxel thick.
         slice_axis: for a slice, the axis of the volume perpendicular to it; None for a volume.
         order: the order of components in the file, or ``"matrix"`` for whole matrices.
         frame: the axes of the components in the file.
@@ -62,8 +62,8 @@ class TensorVolume:
         covariance: (*shape, m, m), the covariance of the components xx xy yy (xz yz zz) along the voxel axes, in the
             squared unit of the tensors, if known (`fit_dwi`); otherwise None.
         modes: (*shape, n, m), the contribution of each of the n images to the noise of these components, if the noise
-            was estimated from residuals (`fit_dwi`, in float32); otherwise None. Unlike the
-            covariance, modes also describe noise that is correlated between voxels.
+            was estimated from residuals (`fit_dwi`, in float32); otherwise None. Unlike the covariance, modes also
+            describe noise that is correlated between voxels.
 
     Raises:
         ValueError: shapes disagree, a spacing is not positive, or a number is not finite.

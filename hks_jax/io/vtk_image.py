@@ -171,7 +171,7 @@ def _check_pieces(content: bytes) -> None:
 
 
 def _check_range(content: bytes, array: str, values: np.ndarray) -> None:
-    """Raise ValueError if the file declares a range of the array that differs from the range of its rows' norms."""
+    """Raise ValueError if the file declares a range of the array that its values and its rows' norms do not have."""
     tag = re.search(rb"<DataArray\b[^>]*\bName=\"" + re.escape(array.encode()) + rb"\"[^>]*>", content)
     told = [float(word) for word in re.findall(rb"\bRangeM(?:in|ax)=\"([^\"]+)\"", tag[0])] if tag else []
     if len(told) < 2 or np.isnan(values).any() or b"vtkGhostType" in content[:10_000]:  # the range omits ghost values
