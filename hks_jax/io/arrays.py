@@ -14,14 +14,14 @@ from hks_jax.io.volume import Format, TensorVolume, describe_tensors
 from hks_jax.storage import load_npy, load_npz, write_npz
 
 
-def _read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, None]:
-    """Return the array of an npy, or the array ``mask`` of an npz, and None in place of an affine."""
+def _read_image(name: str) -> tuple[np.ndarray, None, str]:
+    """Return the array of an npy, or the array ``mask`` of an npz, without an affine and a unit."""
     if name.lower().endswith(".npy"):
-        return load_npy(name), None
+        return load_npy(name), None, ""
     arrays = load_npz(name)
     if "mask" not in arrays:
         raise ValueError(f"{name}: got the arrays {', '.join(sorted(arrays)) or 'none'}; expected an array 'mask'")
-    return arrays["mask"], None
+    return arrays["mask"], None, ""
 
 
 def _read_tensors(

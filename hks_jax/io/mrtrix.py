@@ -18,8 +18,8 @@ _MAGIC = b"mrtrix image"
 _KINDS = {"Int": "i", "UInt": "u", "Float": "f"}
 
 
-def load(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, Float[np.ndarray, "4 4"]]:
-    """Return the voxel values, with axes in the header's sequence, and the affine to scanner coordinates in mm."""
+def _load(name: str) -> tuple[np.ndarray, Float[np.ndarray, "4 4"], str]:
+    """Return the voxel values, with axes in the header's sequence, the affine to scanner coordinates, and the unit."""
     file = existing(name)
     with reading(file, "a readable MRtrix image (.mif)"):
         content = gzip.decompress(file.read_bytes()) if file.name.lower().endswith(".gz") else file.read_bytes()
@@ -42,11 +42,11 @@ def load(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, Float
         affine[:3, :3] *= [float(word) for word in header["vox"][0].split(",")[:3]]
         if not np.isfinite(affine).all() or np.linalg.det(affine[:3, :3]) == 0:
             raise ValueError("transform, vox: got a singular or infinite affine; expected an invertible affine")
-    return values, affine
+    return values, affine, "mm"
 
 
 def _read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolume:
-    values, affine = load(name)
+    values, affine, _ = _load(name)
     if values.ndim != 4 or values.shape[-1] != 6:
         raise ValueError(
             f"{name}: got an image of shape {values.shape}; expected (nx, ny, nz, 6), the components from dwi2tensor"
@@ -92,4 +92,4 @@ def _in_order(flat: np.ndarray, shape: tuple[int, ...], layout: str) -> np.ndarr
     return values[tuple(slice(None, None, -1 if word.startswith("-") else 1) for word in words)]
 
 
-FORMAT = Format((".mif", ".mif.gz"), _read_tensors, read_image=load, image=".nii.gz")
+FORMAT = Format((".mif", ".mif.gz"), _read_tensors, read_image=_load, image=".nii.gz")

@@ -16,7 +16,7 @@ from hks_jax.io.questions import OPEN_FRAME
 from hks_jax.io.repair import require_symmetric
 from hks_jax.io.tables import write_json
 from hks_jax.io.tensor_order import FRAMES, ORDERS, matrices, pack
-from hks_jax.io.units import by_axis, scaled_beside
+from hks_jax.io.units import by_axis
 from hks_jax.io.volume import Format, TensorVolume, corners, describe_tensors, images_of, own_record, placed
 from hks_jax.optional import optional
 from hks_jax.storage import atomic_path, existing, reading
@@ -74,11 +74,10 @@ def affine_in_mm(name: str, image: Any) -> tuple[np.ndarray, str]:
     return np.diag([scale, scale, scale, 1.0]) @ np.asarray(image.affine, np.float64), unit
 
 
-def _read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return voxel values and the affine in mm. If the file has no unit, guess it from the tensors' affine `beside`."""
+def _read_image(name: str) -> tuple[np.ndarray, np.ndarray, str]:
+    """Return voxel values, the affine in mm, and the unit of length that the file declares."""
     image = load(name)
-    own, unit = affine_in_mm(name, image)
-    return voxels(name, image), own if unit or beside is None else scaled_beside(own, beside)
+    return voxels(name, image), *affine_in_mm(name, image)
 
 
 def sidecar_of(path: str | os.PathLike[str]) -> Path:

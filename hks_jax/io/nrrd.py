@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from hks_jax.io.repair import require_symmetric
 from hks_jax.io.tensor_order import matrices, nearest_rotation, pack, to_voxel_axes
-from hks_jax.io.units import millimetres, scaled_beside
+from hks_jax.io.units import millimetres
 from hks_jax.io.volume import Format, TensorVolume, describe_tensors, images_of, own_record
 from hks_jax.optional import optional
 from hks_jax.storage import atomic_path, existing, reading
@@ -136,12 +136,11 @@ def _check_data(file: Path, header: Mapping[str, Any], start: int) -> None:
             content.read()
 
 
-def _read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, Float[np.ndarray, "4 4"] | None]:
-    """Return voxel values and any affine. If the file has no unit, guess it from the tensors' affine `beside`."""
+def _read_image(name: str) -> tuple[np.ndarray, Float[np.ndarray, "4 4"] | None, str]:
+    """Return voxel values, the affine or None, and the unit of length that the file declares."""
     data, header = load(name)
     place = _placement(name, header, list(range(data.ndim)))
-    affine = place.affine
-    return data, affine if affine is None or beside is None or place.unit else scaled_beside(affine, beside)
+    return data, place.affine, place.unit
 
 
 def _read_tensors(name: str, order: str | None, frame: str | None, confidence: float) -> TensorVolume:

@@ -1,13 +1,11 @@
 """Units of lengths, which headers declare, and of diffusivities, which most headers do not declare."""
 
-import math
 import re
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
 
 from hks_jax.io.volume import TensorVolume
 
@@ -49,17 +47,6 @@ def millimetres(where: str, text: str) -> float | None:
 def by_axis(values: Iterable[float]) -> str:
     """Return numbers, one per axis, as a text such as ``2 × 2 × 2.5``."""
     return " × ".join(f"{value:.5g}" for value in values)
-
-
-def scaled_beside(own: Float[np.ndarray, "4 4"], affine: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """Convert the affine `own` of a mask or labels without a unit of length to mm, by comparison with the image's.
-
-    Some programs lose the unit of masks and labels. The function chooses mm, m or µm, whichever gives voxel sizes most
-    similar to the image's.
-    """
-    ratio = np.linalg.norm(affine[:3, :3]) / np.linalg.norm(own[:3, :3])
-    scale = min((1.0, 1e3, 1e-3), key=lambda s: abs(math.log(ratio / s)))
-    return np.diag([scale, scale, scale, 1.0]) @ own
 
 
 def in_mm2_per_s(volume: TensorVolume, unit: Unit) -> TensorVolume:

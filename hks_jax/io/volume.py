@@ -28,8 +28,8 @@ class Format:
     names: tuple[str, ...]  # the suffixes of its files
     read_tensors: Callable[..., "TensorVolume"]  # called with a path, an order, a frame and the `options`
     options: tuple[str, ...] = ()  # further arguments of `hks_jax.io.read_tensors` that the format accepts
-    # Reads masks and labels: takes a path and the tensors' affine, or None; returns voxel values and their affine.
-    read_image: Callable[..., tuple[np.ndarray, np.ndarray | None]] | None = None
+    # Reads masks and labels; returns voxel values, their affine or None, and the declared unit of length, or "".
+    read_image: Callable[[str], tuple[np.ndarray, np.ndarray | None, str]] | None = None
     written: tuple[str, ...] = ()  # the suffixes that can be written
     # Writes results; called with a path, an array, the volume, the array's name, more arrays and the provenance.
     write: Callable[[Path, np.ndarray, "TensorVolume", str, dict[str, Any], str], None] | None = None
