@@ -96,7 +96,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         refuse(args, ("through",), "this option is for a volume; leave it out for a slice")
     if not saved:
         solved = compute_pairs(volume, settings, progress)
-    if args.save_pairs:  # at once, because later steps may fail
+    if args.save_pairs:  # before later steps, which may fail
         with progress.stage("writing", str(args.output / PAIRS)):
             for file in of_earlier(args.output, np.asarray(solved.pairs.eigenvalues), progress):
                 file.unlink(missing_ok=True)

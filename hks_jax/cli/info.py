@@ -140,7 +140,7 @@ def _plain(value: Any) -> str:
 
 
 def _lines(description: dict[str, Any]) -> list[str]:
-    if "sha256" not in description:  # of a result
+    if "sha256" not in description:  # a result has no digest
         return [f"{name:<16}{_plain(value)}" for name, value in description.items() if value]
     lines = [f"{description['file']}: {description['format']}, SHA-256 {description['sha256'][:16]}…"]
     if "vertices" in description:

@@ -159,16 +159,12 @@ def _report(settings: Settings, pairs: hj.Eigenpairs, times: tuple[float, ...]) 
 
 def describe_input(volume: TensorVolume) -> dict[str, Any]:
     """Return the entries of a report about the tensors of a volume, whose mask is the domain."""
-    about = {name: getattr(volume, name) for name in ("shape", "spacing", "length_unit", "unit")}
+    names = ("source", "shape", "spacing", "length_unit", "unit", "order", "frame", "notes")
     return {
-        "source": volume.source,
+        **{name: getattr(volume, name) for name in names},
         "sha256": volume.digest,
-        **about,
         "median_mean_diffusivity": median_mean_diffusivity(volume),
-        "order": volume.order,
-        "frame": volume.frame,
         "voxels_inside": int(volume.inside.sum()),
-        "notes": list(volume.notes),
         "repair": dict(volume.repair) or None,
     }
 

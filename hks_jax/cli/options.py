@@ -153,7 +153,7 @@ class Option(NamedTuple):
         if word.endswith("..."):
             settings["nargs"], word = "+", word[:-3]
         kind = word.split("|") if "|" in word else KINDS.get(word, str)
-        if flags == "output":  # the file of convert
+        if flags == "output":  # for convert, OUT is a file
             kind = Path
         if not word:
             settings["action"] = "store_true"

@@ -79,7 +79,7 @@ def region_table(
     if not regions.nodes.any():
         raise ValueError(f"{atlas}: none of the {regions.labels.size} regions has a voxel in the domain of {source}")
     n_times, n_regions = regions.mean.shape
-    by_time = {"t": result.times, "lambda1_t": result.arrays.get("scaled_times")}  # for --time-unit lambda1
+    by_time = {"t": result.times, "lambda1_t": result.arrays.get("scaled_times")}  # present for --time-unit lambda1
     by_region = {
         "index": regions.labels,
         "voxels": regions.nodes,

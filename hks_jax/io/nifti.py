@@ -127,7 +127,7 @@ def read_tensors(name: str, order: str | None, frame: str | None, image: Any = N
     declared = int(image.header["intent_code"]) == SYMMETRIC_MATRIX
     affine, length_unit = affine_in_mm(name, image)
     encoding, record, notes = _encoding(name), _own_record(image, affine) if declared else {}, list[str]()
-    by_bids = "fsl" if encoding.get("Type") == "tensor" else ""  # xx xy xz yy yz zz
+    by_bids = "fsl" if encoding.get("Type") == "tensor" else ""  # BIDS has FSL's order, xx xy xz yy yz zz
     found = matrices(name, voxels(name, image).reshape(*shape[:3], 6), order, "nifti" if declared else by_bids)
     if declared and found.order != "nifti":
         notes.append(f'components read in order "{order}", as asked; the file declares NIfTI\'s symmetric-matrix order')

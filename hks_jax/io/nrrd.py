@@ -222,7 +222,7 @@ def _store(path: Path, array: np.ndarray, volume: TensorVolume, record: str, kin
     header: dict[str, Any] = {"space": "right-anterior-superior"} if placed else {"space dimension": d}
     if kind:
         directions, kinds = np.concatenate([none, directions]), [kind, *kinds]
-        header["measurement frame"] = nearest_rotation(linear).T  # the file lists the columns
+        header["measurement frame"] = nearest_rotation(linear).T  # NRRD lists this matrix by columns
     elif array.ndim > d:
         directions, kinds = np.concatenate([directions, none]), [*kinds, "list"]
     if placed or volume.length_unit:
@@ -266,7 +266,7 @@ def _rows(header: Mapping[str, Any], n: int) -> Float[np.ndarray, "n d"] | None:
 def _placement(name: str, header: Mapping[str, Any], domain: list[int]) -> Placement:
     d, rows = len(domain), _rows(header, int(header["dimension"]))
     unit, scales = _lengths(name, header, domain)
-    measured = np.asarray(header.get("measurement frame", np.nan), np.float64).T  # the file lists it by columns
+    measured = np.asarray(header.get("measurement frame", np.nan), np.float64).T  # NRRD lists this matrix by columns
     frame = measured if np.isfinite(measured).all() else None
     if rows is None:
         spacings = np.asarray(header.get("spacings", np.full(int(header["dimension"]), np.nan)), np.float64)[domain]

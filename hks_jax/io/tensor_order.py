@@ -79,7 +79,7 @@ def nearest_rotation(linear: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d
 
 
 def _indices(order: str, d: int) -> list[tuple[int, int]]:
-    components = ORDERS["fsl" if order == "nrrd" else order]  # NRRD has FSL's sequence
+    components = ORDERS["fsl" if order == "nrrd" else order]  # NRRD has FSL's order of components
     pairs = [("xyz".index(pair[0]), "xyz".index(pair[1])) for pair in components]
     return [pair for pair in pairs if max(pair) < d]
 

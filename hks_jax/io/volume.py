@@ -190,7 +190,7 @@ class TensorVolume:
             ValueError: the fit did not estimate the noise.
         """
         if self.modes is not None:
-            return TensorNoise.from_modes(self.modes, grid, unknowns=7)  # the tensor and the unweighted signal
+            return TensorNoise.from_modes(self.modes, grid, unknowns=7)  # six components and the unweighted signal
         if self.covariance is None:
             raise ValueError(
                 "noise: got a volume without an estimate of its noise; fit the tensors by `fit_dwi` with noise=, or "

@@ -224,7 +224,7 @@ def _on_grid(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 def _as_plane(volume: TensorVolume) -> TensorVolume:
     """Return an image one voxel thick as a slice, if all components of its tensors across the plane are zero."""
     size = np.abs(volume.tensors).max()
-    rounding = 100 * np.finfo(volume.tensors.dtype).eps * size  # from the rotation to voxel axes
+    rounding = 100 * np.finfo(volume.tensors.dtype).eps * size  # due to the rotation to the voxel axes
     for axis in range(3):
         if volume.shape[axis] == 1 and size > 0 and np.abs(volume.tensors[..., axis, :]).max() <= rounding:
             plane = volume.slice(("x", "y", "z")[axis], 0)

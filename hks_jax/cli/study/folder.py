@@ -164,7 +164,7 @@ class Study:
         about = {**self.record, "chosen": chosen, "description": times_text(self.time_unit)}
         write_json(self.folder / "study.json", about)
         covariates = list(dict.fromkeys(name for subject in subjects for name in subject.covariates))
-        first = {subject.participant: subject.covariates for subject in reversed(subjects)}  # first session
+        first = {subject.participant: subject.covariates for subject in reversed(subjects)}  # of the first session
         rows = [(who, *map(first[who].get, covariates)) for who in dict.fromkeys(s.participant for s in subjects)]
         write_table(self.folder / "participants.tsv", ("participant_id", *covariates), rows)
 

@@ -125,7 +125,7 @@ class _Task(NamedTuple):
             _compute(study, subject, self.fingerprint, progress)
         if self.regions:
             table = study.path(subject, f"{REGIONS}.tsv")
-            for old in (table.with_suffix(".json"), table):  # sidecar first
+            for old in (table.with_suffix(".json"), table):  # the sidecar first, because it marks completion
                 old.unlink(missing_ok=True)
             with progress.stage("regions"):
                 source, args = study.path(subject, f"{MAP}.npz"), subject.args
@@ -141,7 +141,7 @@ def _compute(study: Study, subject: Subject, fingerprint: str, progress: StudyPr
         scaled["scaled_times"] = np.array(study.settings.times.explicit)
         own = scaled["scaled_times"] / float(positive_range(solved.pairs)[0])
         solved = solved._replace(settings=replace(solved.settings, times=Times(tuple(own.tolist()), 0)))
-    if args.noise == "residuals" and solved.volume.covariance is None:  # not saved with eigenpairs
+    if args.noise == "residuals" and solved.volume.covariance is None:  # covariances are not saved with eigenpairs
         volume = read_volume(args, StudyProgress(1, quiet=True, stream=io.StringIO()))
         solved = solved._replace(volume=volume.with_mask(solved.volume.mask))
     result = signature_of(args, solved, progress)
