@@ -7,7 +7,7 @@ The steps from tensors to a signature are:
     pairs = eigenpairs(field, k=200)
     signature = hks(pairs, default_times(pairs, 8))
 
-The examples of the reference begin with:
+The examples in all docstrings begin with these lines:
 
     >>> import pathlib, tempfile
     >>> import jax, jax.numpy as jnp, numpy as np
@@ -103,8 +103,7 @@ _LATER = dict.fromkeys(("fit_metric", "identifiability"), "hks_jax.inverse") | d
 
 
 def __getattr__(name: str) -> Any:
-    # These modules (several devices, fits with lineax, files, figures) are imported on first use, because their import
-    # is slow.
+    # The modules for several devices, fits, files and figures are imported on first use, because their import is slow.
     if name in ("devices", "inverse", "io", "plot"):
         return importlib.import_module(f"hks_jax.{name}")
     if name in _LATER:

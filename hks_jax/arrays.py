@@ -17,7 +17,7 @@ R = TypeVar("R")
 
 
 class ByKey:
-    """A base class of objects that are compared and hashed by a key, so they can be static under `jax.jit`."""
+    """A base class of objects that are compared and hashed by a key, so that they can be static under `jax.jit`."""
 
     _key: Any
 
@@ -29,7 +29,7 @@ class ByKey:
 
 
 class StaticArray(ByKey):
-    """A read-only NumPy array that is constant at trace time."""
+    """A read-only NumPy array that is static under `jax.jit`."""
 
     def __init__(self, value: Any, dtype: Any = None) -> None:
         array = np.array(value, dtype=dtype, order="C")
@@ -46,12 +46,12 @@ class StaticArray(ByKey):
 
 
 def jax_array(value: Any) -> Array:
-    """Return a JAX array, as `jnp.asarray` does, which compiles a program for every shape of NumPy arrays."""
+    """Return a JAX array like `jnp.asarray`, but compile no program for a new shape of NumPy arrays."""
     return jax.device_put(value) if isinstance(value, np.ndarray) and not is_staged() else jnp.asarray(value)
 
 
 def describe_array(value: Any) -> str:
-    """Return dtype and shape of an array, such as ``float64 (40, 40, 2, 2)``, or the repr of any other leaf."""
+    """Return the dtype and shape of an array, such as ``float64 (40, 40, 2, 2)``; otherwise the object's repr."""
     dtype, shape = getattr(value, "dtype", None), getattr(value, "shape", None)
     return repr(value) if dtype is None or shape is None else f"{dtype} {tuple(shape)}"
 
@@ -59,7 +59,7 @@ def describe_array(value: Any) -> str:
 def nan_outside(
     values: Float[Array, "*leading_and_shape"], known: Bool[np.ndarray | Array, "*_shape"]
 ) -> Float[Array, "*leading_and_shape"]:
-    """Insert NaN where a value is not defined, such as outside a mask; `jax.debug_nans` ignores these NaNs."""
+    """Replace values where ``known`` is false, such as outside a mask, by NaN that `jax.debug_nans` ignores."""
     if isinstance(known, np.ndarray) and known.all():
         return values
     with jax.debug_nans(False):
@@ -67,7 +67,7 @@ def nan_outside(
 
 
 def nan_is_meant(function: Callable[P, R]) -> Callable[P, R]:
-    """Return the function, without JAX's check for NaN; for functions of values from `nan_outside`."""
+    """Turn off `jax.debug_nans` within a function whose arguments may contain NaN from `nan_outside`."""
 
     @wraps(function)
     def run(*args: P.args, **kwargs: P.kwargs) -> R:

@@ -11,8 +11,8 @@ def keep_compiled(folder: str | os.PathLike[str] | None = None) -> Path | None:
     """Let JAX store compiled programs in a folder, from which later processes read them instead of compiling again.
 
     Call this function once, before any computation. JAX has one such cache per process, so your own programs are stored
-    there as well. Importing the package does not change this setting. A folder that is already set by
-    ``jax_compilation_cache_dir`` or the environment is kept.
+    there as well. Importing the package does not change this setting. A folder that JAX's configuration or the
+    environment already sets as ``jax_compilation_cache_dir`` is kept.
 
     Args:
         folder: the folder, by default ``hks-jax`` in the platform's folder of user caches.
@@ -36,7 +36,7 @@ def keep_compiled(folder: str | os.PathLike[str] | None = None) -> Path | None:
     if not os.access(path, os.W_OK):
         return None
     jax.config.update("jax_compilation_cache_dir", str(path))
-    # By default JAX stores programs whose compilation takes a second or more. Reading is ten times as fast as
-    # compiling.
+    # By default, JAX stores only programs whose compilation takes at least a second. Reading a program is ten times as
+    # fast as compiling it.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     return path

@@ -1,7 +1,8 @@
-"""Checks of arguments that many functions have."""
+"""Checks of arguments that many functions share."""
 
 import math
 import operator
+from contextlib import suppress
 from typing import Any
 
 import jax
@@ -18,7 +19,7 @@ def require_number(
 ) -> None:
     """Raise ValueError unless a setting is a real number between two limits; traced numbers pass.
 
-    The limits are exclusive, except that the lower one may be inclusive.
+    The upper limit is excluded. The lower limit ``above`` is excluded unless ``inclusive`` is set.
     """
     if is_traced(value):
         return
@@ -33,22 +34,20 @@ def require_number(
 
 
 def require_real(name: str, values: Any) -> None:
-    """Raise ValueError for complex numbers, which would lose their imaginary part, and for dtypes that JAX lacks."""
+    """Raise ValueError for complex numbers, masked values, and floating-point types that JAX does not support."""
     leaves = jax.tree.leaves(values)
     if any(np.iscomplexobj(leaf) for leaf in leaves):
         raise ValueError(
-            f"{name}: got complex numbers; expected real numbers. Pass the real part if the imaginary part is rounding"
+            f"{name}: got complex numbers; expected real numbers. If imaginary parts are only rounding, pass .real"
         )
     if any(isinstance(leaf, np.ndarray) and leaf.dtype.kind == "f" and leaf.dtype.itemsize > 8 for leaf in leaves):
         raise ValueError(f"{name}: got {np.dtype(np.longdouble)}, which JAX does not support; use .astype(np.float64)")
     if any(isinstance(leaf, np.ma.MaskedArray) and np.ma.is_masked(leaf) for leaf in leaves):
-        raise ValueError(
-            f"{name}: got a masked array; expected an array whose values are all known; use .filled(value)"
-        )
+        raise ValueError(f"{name}: got a masked array; expected an array without masked entries; use .filled(value)")
 
 
 def real_array(name: str, values: Any) -> Array:
-    """Return a floating-point array unchanged, or integers as floats of default precision, after `require_real`."""
+    """Return values as a JAX array of floating-point numbers, after the checks of `require_real`."""
     require_real(name, values)
     if isinstance(values, np.ndarray):
         values = values.astype(values.dtype.newbyteorder("="), copy=False)
@@ -57,17 +56,15 @@ def real_array(name: str, values: Any) -> Array:
 
 
 def require_count(name: str, value: Any, least: int = 1) -> None:
-    """Raise ValueError unless a setting is an integer that is at least the given minimum."""
-    try:
+    """Raise ValueError unless a setting is an integer of at least ``least``."""
+    with suppress(TypeError):
         if operator.index(value) >= least:
             return
-    except TypeError:
-        pass
     raise ValueError(f"{name}: got {value!r}; expected an integer of at least {least}")
 
 
 def checked_times(times: Any, dtype: Any) -> Float[Array, " n"]:
-    """Return times as an array (n,); raise ValueError unless they are 1-D, positive and finite."""
+    """Return times as an array (n,); raise ValueError unless n ≥ 1 and the times are positive and finite."""
     require_real("times", times)
     try:
         is_array = isinstance(times, jax.Array) or is_traced(times)

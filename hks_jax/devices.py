@@ -1,4 +1,4 @@
-"""Several devices: distributed batches, and grids cut into slabs. docs/devices.md describes the communication."""
+"""Computations on several devices: batches, and grids cut into slabs. docs/devices.md describes the communication."""
 
 from collections.abc import Callable
 from functools import partial
@@ -18,10 +18,10 @@ from hks_jax.traced import is_traced
 
 
 def map_fields(function: Callable[[Any], Any], batch: Any, mesh: Mesh) -> Any:
-    """Apply a function to each entry of a batch, where every device processes its share sequentially.
+    """Apply a function to each entry of a batch; every device processes its share of the entries sequentially.
 
-    The devices do not communicate. The result is differentiable if the function is. The same function object is
-    compiled once.
+    The devices do not communicate. The result is differentiable if the function is. Repeated calls with the same
+    function object compile it only once.
 
     Args:
         function: a traceable function of one entry, such as ``lambda T: hj.hks(hj.eigenpairs(hj.TensorField(grid, T),
@@ -30,11 +30,11 @@ def map_fields(function: Callable[[Any], Any], batch: Any, mesh: Mesh) -> Any:
         mesh: a mesh of devices along one axis.
 
     Returns:
-        The result of ``jax.lax.map(function, batch)``, arrays (n, …). They stay distributed if n is a multiple of the
-        number of devices; otherwise every device has all entries.
+        The result of ``jax.lax.map(function, batch)``, a pytree of arrays (n, …). If n is a multiple of the number of
+        devices, each device keeps its share of the entries; otherwise every device has all entries.
 
     Raises:
-        ValueError: if arrays have different lengths, if there are none, or if the mesh has several axes.
+        ValueError: if arrays have different lengths, if the batch is empty, or if the mesh has several axes.
 
     Examples:
         >>> area = lambda T: hj.assemble(hj.TensorField(field.grid, T)).volume
@@ -52,7 +52,8 @@ def map_fields(function: Callable[[Any], Any], batch: Any, mesh: Mesh) -> Any:
 @partial(jax.jit, static_argnames=("function", "mesh"))
 def _map(function: Callable[[Any], Any], batch: Any, mesh: Mesh) -> Any:
     n, spec = jax.tree.leaves(batch)[0].shape[0], PartitionSpec(mesh.axis_names[0])
-    # Shares are padded with the last entry, because a function of zeros might return NaN or not terminate.
+    # The batch is padded with copies of its last entry, because for zeros the function might return NaN or not
+    # terminate.
     filled = jax.tree.map(lambda x: x[jnp.minimum(jnp.arange(-(-n // mesh.size) * mesh.size), n - 1)], batch)
     share = jax.shard_map(
         lambda own: jax.lax.map(function, own), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
@@ -69,19 +70,19 @@ def heat_columns(
     tolerance: float = 1e-8,
     degree: int | None = None,
 ) -> Float[Array, "n_times *padded b"]:
-    """Return exp(−tD⁻¹K) applied to columns, for each time. Sources D⁻¹eᵢ give columns of the heat kernel.
+    """Return exp(−tD⁻¹K) x for each time t and column x. Columns x = D⁻¹eᵢ give columns of the heat kernel.
 
-    This function serves fields that exceed the memory of a device. Each degree of the Chebyshev expansion takes one
-    stencil product and the exchange of one plane of nodes with each neighbour. All times use the same products.
+    Use this function for fields that exceed the memory of one device. Each degree of the Chebyshev expansion takes one
+    product with K; for this product, neighbouring devices exchange one plane of nodes. All times use the same products.
 
     Args:
         slabs: the partition of the grid.
         stiffness: the stiffness matrix K, ``slabs.split(pencil.stiffness.coefficients, 1)``.
         lumped: the row sums D of the mass matrix, ``slabs.split(...)``; 0 at nodes that are not free.
-        columns: nodal values with the column as the last axis, ``slabs.split(...)``.
+        columns: nodal values x; the last axis is the index of the column. ``slabs.split(...)`` makes them.
         times: (n_times,), nonnegative.
         tolerance: a bound on the truncation error of the expansion, relative to the columns, in the norm of D.
-        degree: the degree of the polynomial, by default the one that the tolerance needs. It is required for traced
+        degree: the degree of the polynomial, by default the least that satisfies the tolerance. Required for traced
             arrays.
 
     Returns:
@@ -95,7 +96,7 @@ def heat_columns(
         >>> slabs = hj.devices.Slabs(jax.make_mesh((1,), ("devices",)), (9, 9), (False, False))
         >>> pencil, one = hj.assemble(field, mass="lumped"), slabs.split(jnp.ones((9, 9, 1)))
         >>> K, D = slabs.split(pencil.stiffness.coefficients, 1), slabs.split(pencil.mass.diagonal().reshape(9, 9))
-        >>> print(hj.devices.heat_columns(slabs, K, D, one, [0.5]).mean().round(3))  # a constant stays
+        >>> print(hj.devices.heat_columns(slabs, K, D, one, [0.5]).mean().round(3))  # a constant does not change
         1.0
     """
     slabs.check("stiffness", stiffness, 1)
@@ -112,7 +113,7 @@ def heat_columns(
     top = gershgorin(stiffness, _inverse(lumped))
     if degree is None:
         if is_traced((top, times)):
-            raise ValueError("degree: got None with traced matrices or times; expected a number")
+            raise ValueError("degree: got None with traced matrices or times; expected an integer")
         if times.size and not float(jnp.min(times)) >= 0:
             raise ValueError(f"times: got {times}; expected nonnegative numbers")
         degree = least_degree(float(jnp.max(times, initial=0)) * float(top) / 2, tolerance)
@@ -128,9 +129,10 @@ def chebyshev_series(
     top: Float[Array, ""],
     series: Float[Array, "m terms"],
 ) -> Float[Array, "m *padded b"]:
-    """Return Σₙ seriesₘₙ Tₙ(2D⁻¹K/top − 1) columns for a bound ``top`` on the spectrum of D⁻¹K and a degree ≥ 1.
+    """Return Σₙ cₘₙ Tₙ(2D⁻¹K/top − 1) x for each column x, where c is the series and Tₙ are Chebyshev polynomials.
 
-    The arrays have the layout of `heat_columns`. The result is linear in series and columns, and differentiable.
+    The number ``top`` is an upper bound of the spectrum of D⁻¹K. The series has at least two terms. The arrays have the
+    layout of `heat_columns`. The result is linear in the series and in the columns, and differentiable.
 
     Examples:
         >>> slabs = hj.devices.Slabs(jax.make_mesh((1,), ("devices",)), (9, 9), (False, False))

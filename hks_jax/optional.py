@@ -15,7 +15,7 @@ _LIBRARIES = {
 
 
 def optional(module: str) -> ModuleType:
-    """Import a module of an optional library, such as ``"dipy.reconst.dti"``; an ImportError has the remedy."""
+    """Import a module of an optional library, such as ``"dipy.reconst.dti"``; an ImportError states the remedy."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

@@ -24,7 +24,7 @@ _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary name beside `path`, and atomically move the file with this name to `path` at the end.
+    """Yield the path of a temporary file beside `path`; at the end, move this file atomically to `path`.
 
     If the body raises, the temporary file is removed and `path` does not change. Missing parent folders are created.
 
@@ -36,7 +36,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    # The suffix must be last, because libraries choose the format by it.
+    # Libraries choose the format by the suffix, so the temporary name must end with it.
     temporary = target.with_name(f".{uuid.uuid4().hex[:12]}.{target.name}")
     try:
         yield temporary
@@ -49,8 +49,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 def atomic_folder(path: str | os.PathLike[str], stale: Callable[[], Iterable[Path]] = tuple) -> Iterator[Path]:
     """Yield a temporary folder beside `path`; move the files written there into `path` at the end.
 
-    Files with the same names in `path` are replaced atomically, and others remain. If the body raises, its files are
-    removed, and `path` does not change and is not created.
+    Each moved file atomically replaces a file of the same name in `path`; other files remain. If the body raises, the
+    temporary folder is removed, and `path` is neither changed nor created.
 
     Args:
         path: the folder.
@@ -92,11 +92,11 @@ def atomic_folder(path: str | os.PathLike[str], stale: Callable[[], Iterable[Pat
 
 @contextmanager
 def claim(path: str | os.PathLike[str]) -> Iterator[bool]:
-    """Yield whether this process has exclusive access to a piece of work, by a lock on the file at `path`.
+    """Lock the file at `path`, and yield whether this process thus has exclusive access to a piece of work.
 
     At the end the file is removed, and its folder as well if it is empty. If the process dies, the operating system
-    releases the lock and the file remains, which shows that the work was begun. Without such locks, as on Windows and
-    some network drives, every process gets access.
+    releases the lock and the file remains, which shows that the work was begun. Windows and some network drives have no
+    such locks; there, every process gets access.
     """
     file = Path(path)
     held = _hold(file)
@@ -116,8 +116,8 @@ def _hold(file: Path) -> IO[str] | None:
     """Return the open and locked file, or None if another process has locked it."""
     while True:
         file.parent.mkdir(parents=True, exist_ok=True)
-        # The file stays open after this function. Between any two of these steps another process may finish and remove
-        # the file and its folder.
+        # The caller closes the file. Between any two of these steps, another process may finish its work and remove the
+        # file and its folder.
         with suppress(FileNotFoundError):
             held = open(file, "a", encoding="utf-8")  # noqa: SIM115
             try:
@@ -147,9 +147,9 @@ def existing(path: str | os.PathLike[str]) -> Path:
 def reading(path: str | os.PathLike[str], kind: str) -> Iterator[None]:
     """Convert every error that a library raises for the content of a file to a ValueError that names the file.
 
-    Libraries raise nearly any error for damaged files: errors of the parser, of struct, zlib and zipfile, of indices,
-    or of memory for impossible sizes. The body should contain only the library's call and checks of its result. The
-    kind of file has its article, as in ``"a readable npz archive"``.
+    For damaged files, libraries raise nearly any error, such as IndexError, zlib.error, or MemoryError for impossible
+    sizes. The body should contain only the library's call and checks of its result. ``kind`` is the kind of file with
+    its article, as in ``"a readable npz archive"``.
     """
     try:
         yield
@@ -167,7 +167,7 @@ def reading(path: str | os.PathLike[str], kind: str) -> Iterator[None]:
 def load_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     """Return all arrays of an npz archive by name, after their checksums are verified.
 
-    A file that is no such archive, is damaged, or contains pickled objects raises ValueError.
+    Raises ValueError if the file is damaged, is not such an archive, or contains pickled objects.
     """
     file, arrays = existing(path), {}
     with reading(file, "a readable npz archive of plain arrays"), zipfile.ZipFile(file) as archive:
@@ -186,19 +186,19 @@ def write_npz(path: str | os.PathLike[str], content: Mapping[str, Any], compress
 
 
 def _check_number(file: Path, archive: zipfile.ZipFile) -> None:
-    """Raise ValueError unless the archive's end states the number of listed members. A damaged list omits members."""
+    """Raise ValueError unless the archive lists as many members as its end record states."""
     with open(file, "rb") as stream:
         stream.seek(-(22 + len(archive.comment)), os.SEEK_END)
         end = stream.read()
     declared, listed = int.from_bytes(end[10:12], "little"), len(archive.filelist)
     if declared not in (listed, 0xFFFF):  # 0xFFFF means a larger number
-        raise ValueError(f"its end states {declared} members, but it lists {listed}")
+        raise ValueError(f"its end record states {declared} members, but its list has {listed}")
 
 
 def load_npy(path: str | os.PathLike[str]) -> np.ndarray:
     """Return the array of an npy file, with errors as in `load_npz`.
 
-    There is no checksum; only the file's length is compared with the declared length.
+    The format has no checksum; only the file's length is compared with the declared length.
     """
     file = existing(path)
     with reading(file, "a readable npy array"), open(file, "rb") as stream:
@@ -206,15 +206,15 @@ def load_npy(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def _array(stream: io.BytesIO | io.BufferedReader, length: int) -> np.ndarray:
-    """Return the array in a stream. Its size is compared with the stream's before memory is allocated."""
+    """Return the array in a stream, after its declared size was compared with the stream's length."""
     version = npy.read_magic(stream)
     if version not in _HEADERS:
-        raise ValueError(f"format version {version}; expected one of {', '.join(map(str, _HEADERS))}")
+        raise ValueError(f"got format version {version}; expected one of {', '.join(map(str, _HEADERS))}")
     shape, _, dtype = _HEADERS[version](stream)
     if dtype.hasobject:
         raise ValueError("it contains pickled objects, which are not read because they could run programs")
     declared, held = math.prod(shape) * dtype.itemsize, length - stream.tell()
     if min(shape, default=0) < 0 or declared != held:
-        raise ValueError(f"{dtype} of shape {shape} takes {declared} bytes, but the file has {held}")
+        raise ValueError(f"an array {dtype} of shape {shape} has {declared} bytes, but the file has {held}")
     stream.seek(0)
     return npy.read_array(stream, allow_pickle=False).astype(dtype.newbyteorder("="), copy=False)

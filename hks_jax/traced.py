@@ -14,5 +14,5 @@ def is_traced(tree: Any) -> bool:
 
 
 def is_staged() -> bool:
-    """Return whether every operation is staged for a later computation, so that it returns a tracer."""
-    return is_traced(jax.lax.stop_gradient(_CONSTANT))  # an operation that, unless staged, runs nothing
+    """Return whether JAX stages every operation, as under `jax.jit`, so that even constants give tracers."""
+    return is_traced(jax.lax.stop_gradient(_CONSTANT))  # this operation computes nothing unless it is staged

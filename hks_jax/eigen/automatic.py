@@ -19,13 +19,14 @@ SOLVERS: dict[str, Callable[[], Eigensolver]] = {
 }
 
 _SMALL = 1500
-"""The largest number of unknowns for which the dense solver is chosen. It takes O(n³) time and misses no eigenvalue."""
+"""The largest number of unknowns n for which the dense solver is chosen; it takes O(n³) time."""
 
-# Shift-invert competes with "ours": the Chebyshev filter on grids in 3D or in float32, else block Lanczos. Ours takes
-# about five seconds to compile at any size. So up to n·k = 5 million no solver is the fastest both in the first and in
-# later calls. The choice minimises the larger of the two factors lost (benchmarks/first_answer/automatic.py), except
-# for small volumes in float32. Block Lanczos in float32 also factorises in float32. So it searches repeatedly, and some
-# pairs do not converge.
+# Shift-invert competes with a solver in JAX, "ours": the Chebyshev filter on grids in 3D or in float32, otherwise block
+# Lanczos. A solver in JAX takes about five seconds to compile at any size. So up to n·k = 5 million, no solver is the
+# fastest in the first call and in later calls. In each of these two cases, a solver is slower than the fastest one by
+# some factor; the choice minimises the larger factor (benchmarks/first_answer/automatic.py), except for small volumes
+# in float32. Block Lanczos in float32 also factorises in float32; so it searches repeatedly, and some pairs do not
+# converge.
 _LARGE, _LARGE_IN_SINGLE = 800_000, 5_000_000
 """The least n·k for which a solver in JAX is chosen. The second value is for 2D grids in single precision."""
 
@@ -53,31 +54,28 @@ def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensol
 def choose_for_fit(pencil: AnyPencil, k: int) -> Eigensolver:
     """Return the solver that ``"auto"`` chooses in a fit.
 
-    A fit takes many products with one Jacobian. Block Lanczos reuses its factorisations in these products; the filter
-    has no factorisations. Fits are traced, so that the solver must not run on the host.
+    A fit multiplies many vectors by each Jacobian. Block Lanczos reuses its factorisations in these products; the
+    Chebyshev filter has no factorisations. Fits are traced, so the solver must not run on the host.
     """
     n, fitting = pencil.space.n_dof, BlockLanczos(adjoint=FactorisedAdjoint(1e-5, solves=20))
     return fitting if n > _SMALL and k + 20 <= fitting.max_pairs(n) else Dense()
 
 
 def _automatic(pencil: Pencil, k: int) -> Eigensolver:
-    ours: Eigensolver
     n, volume = pencil.space.n_dof, pencil.space.dimension == 3
     if n <= _SMALL or 4 * k > n:
         return Dense()
-    known = is_concrete_on_cpu(jax.lax.stop_gradient((pencil.stiffness, pencil.mass)))
-    if not (pencil.measured and pencil.bounded):
-        ours = BlockLanczos() if k < BlockLanczos().max_pairs(n) else Dense()
-        return ShiftInvert() if known and n * k < _LARGE else ours
-    exact = pencil.stiffness.dtype == np.float64
+    exact, laplacian = pencil.stiffness.dtype == np.float64, pencil.measured and pencil.bounded
     # In 3D factorisations have much fill-in, and in float32 they lose too many digits.
-    matrix_free = isinstance(pencil.stiffness, StencilOperator) and (volume or not exact)
-    ours = ChebyshevFilter() if matrix_free and k < ChebyshevFilter().max_pairs(n) else BlockLanczos()
-    if k >= ours.max_pairs(n):  # the driver computes one additional pair
-        ours = Dense()
-    if not known:
+    matrix_free = laplacian and isinstance(pencil.stiffness, StencilOperator) and (volume or not exact)
+    candidates = ([ChebyshevFilter()] if matrix_free else []) + [BlockLanczos()]
+    # The driver computes one additional pair.
+    ours = next((solver for solver in candidates if k < solver.max_pairs(n)), Dense())
+    if not is_concrete_on_cpu(jax.lax.stop_gradient((pencil.stiffness, pencil.mass))):
         return ours
-    # The host's solver computes in float64, also for float32 matrices.
+    if not laplacian:
+        return ShiftInvert() if n * k < _LARGE else ours
+    # Shift-invert computes in float64, also for float32 matrices.
     suited = ChebyshevFilter if volume or not exact else BlockLanczos
     large = _LARGE if exact or volume else _LARGE_IN_SINGLE
     return ours if isinstance(ours, suited) and n * k >= large else ShiftInvert()

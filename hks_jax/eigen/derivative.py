@@ -1,4 +1,4 @@
-"""Derivatives of eigenpairs, the lowest or the first above an origin, with respect to stiffness and mass."""
+"""Derivatives of eigenpairs with respect to stiffness and mass."""
 
 from functools import partial
 from typing import Any, Literal
@@ -29,7 +29,7 @@ OnFailure = Literal["nothing", "warning", "error"]
 """The action if the linear solves of a derivative do not converge, in addition to the result NaN."""
 
 _ON_HOST = 1 << 22
-"""The largest size of the eigenvectors for which NumPy differentiates, as fast as JAX and without compilation."""
+"""The largest number of eigenvectors' entries for which NumPy differentiates as fast as JAX, without compilation."""
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 2, 3, 4, 5, 6))
@@ -39,9 +39,10 @@ def solved(
     """Return k eigenvalues, their eigenvectors, the frame (the same vectors), the next eigenvalue, and a bound.
 
     The pairs are the lowest or, if ``interior``, the first above the origin of a `LocatedPencil`. The derivative of the
-    frame is that of the eigenvectors without their rotation among the k. The next eigenvalue is infinite unless
-    ``extra`` = 1; the bound is the solver's certificate. Derivatives treat these two as constants. A derivative that
-    does not converge is NaN, with an error if ``throw``, and otherwise a warning if values are concrete.
+    frame is that of the eigenvectors, but excludes rotations of the k eigenvectors among themselves. The next
+    eigenvalue is infinite unless ``extra`` = 1; the bound is the solver's certificate. Derivatives treat these two as
+    constants. A derivative whose linear solves do not converge is NaN. This also raises an error if ``throw`` is set,
+    and otherwise warns if values are concrete.
     """
     values, vectors, complete_below = _computed(solver, pencil, k, extra, interior, report)
     values, vectors, following = _cut(values, vectors, k)
@@ -52,35 +53,35 @@ def solved(
 #
 #     dλᵢ = φᵢᵀfᵢ,    dφᵢ = −½ (φᵢᵀ dM φᵢ) φᵢ + Σ_{j≠i} φⱼ (φⱼᵀfᵢ)/(λᵢ − λⱼ).
 #
-# The sum is over all j. Its part over the computed pairs is evaluated directly. The remainder xᵢ is the solution of
+# The sum is over all j. Its terms for computed pairs are evaluated directly. The sum xᵢ of the other terms solves
 #
 #     (K − λᵢM) xᵢ = −Q fᵢ,   Φᵀ M xᵢ = 0,   Q = I − MΦΦᵀ,
 #
 # on the M-orthogonal complement of the computed Φ, where K − λᵢM is positive definite. Reverse mode uses the symmetry
-# of the map fᵢ ↦ xᵢ. The solver computes some guard pairs beyond k, so that λᵢ has a distance from the eigenvalues on
-# the complement. In the interior of a spectrum, the complement has eigenvalues on both sides, and so there are guards
-# on both sides: at most half of them lie below the origin, and the others follow the k pairs.
+# of the map fᵢ ↦ xᵢ. The solver computes some guard pairs beyond k, so that λᵢ is not close to the eigenvalues on the
+# complement. In the interior of a spectrum, the complement has eigenvalues on both sides of λᵢ. So there are guards on
+# both sides: at most half of the guards lie below the origin, and the others follow the k pairs.
 #
 # Within a multiple eigenvalue, the coefficient of φⱼ in dφᵢ (j ≠ i, λᵢ = λⱼ) is a gauge, because every basis of the
 # eigenspace is valid. The rule sets it to −½ φⱼᵀ dM φᵢ, which keeps Φ M-orthonormal and is never NaN. If a gap is below
 # √ε (λ − λ₀), where λ₀ is the lowest computed eigenvalue, the rule does the same, because division by such a gap would
 # lose all digits. So dφᵢ is a derivative only if λᵢ is simple; of the dλᵢ of equal eigenvalues, only the sum has a
-# meaning. Quantities that are independent of the basis, such as spectral functions, must not use this gauge, and
-# `of_simple` hides the gauge from users. Such quantities use the frame instead: its derivative contains only the sum
-# over j > k, which is the same for every basis of the first k eigenvectors (hks_jax/signatures/spectral_functions.py).
+# meaning. Quantities that are independent of the basis, such as spectral functions, must not use this gauge. They use
+# the frame instead: its derivative contains only the sum over j > k, which is the same for every basis of the first k
+# eigenvectors (hks_jax/signatures/spectral_functions.py). `of_simple` hides the gauge from users.
 @solved.defjvp
 def _solved_jvp(
     solver: Eigensolver, k: int, extra: int, interior: bool, throw: bool, report: Report, primals: Any, changes: Any
 ) -> tuple[tuple, tuple]:
     pencil, change = first_order_only(primals[0]), changes[0]
     n_dof, sides = pencil.size, 2 if interior else 1
-    spare = max(extra, min(sides * solver.guards(k, n_dof), min(solver.max_pairs(n_dof), n_dof) - k))
+    spare = max(extra, min(sides * solver.guards(k, n_dof), solver.max_pairs(n_dof) - k))
     values, vectors, complete_below = _computed(solver, pencil, k, spare, interior, report)
     adjoint = InteriorAdjoint(solver.adjoint.tolerance) if interior else solver.adjoint
     # The preparation does not depend on the change, so that all products with one Jacobian share it.
     prepared = one_by_one(_prepare, (adjoint, k), pencil, values) if _solves(pencil, k, len(values)) else None
     if isinstance(pencil, Pencil) and pencil.metric is not None:
-        # Reverse mode stores all arrays of the arguments, but only estimates need the metric.
+        # Reverse mode stores all arrays of the arguments; derivatives do not need the metric.
         pencil = eqx.tree_at(lambda p: p.metric, pencil, None)
     on_failure: OnFailure = "error" if throw else "nothing" if is_traced(primals) else "warning"
     eigenvalues, functions, following = _cut(values, vectors, k)
@@ -92,7 +93,7 @@ def _solved_jvp(
 def _computed(
     solver: Eigensolver, pencil: SymmetricPencil, k: int, spare: int, interior: bool, report: Report
 ) -> RawPairs:
-    """Return k + spare computed pairs, and the bound of the solver."""
+    """Return k + spare computed pairs, and the bound that the solver certifies."""
     if interior:
         return one_by_one(first_from_origin, (solver, k, spare, report), pencil)
     values, vectors, bound = one_by_one(_lowest, (solver, k + spare, report), pencil)
@@ -108,7 +109,7 @@ def _cut(xp: Any, values: Any, vectors: Any, k: int) -> tuple[Any, Any, Any]:
 
 
 def _solves(pencil: SymmetricPencil, k: int, p: int) -> bool:
-    """Return whether derivatives of the first k of p pairs have components along other eigenvectors."""
+    """Return whether derivatives of the first k of p computed pairs have components along eigenvectors not computed."""
     return p < pencil.size and pencil.n_fixed < k
 
 
@@ -118,7 +119,7 @@ def _shapes(*args: Any) -> tuple[Any, Any, Any]:
 
 
 def _numpy_rule(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
-    """Return the tangents or, given cotangents y, the cotangents of the change, by NumPy."""
+    """Compute `tangents_of` by NumPy or, given cotangents y of its result, the cotangents of the change."""
     adjoint, on_failure, prepared, pencil, _, *pairs = known
     values, vectors, functions = map(np.asarray, pairs)
     if vectors.size > _ON_HOST or x is None:
@@ -156,14 +157,14 @@ def _numpy_rule(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> A
 
 
 def change_of(change: SymmetricPencil, x: Rows, *p: Rows) -> SymmetricPencil:
-    """Return the cotangent of the change: Σ pxᵀ for stiffness and mass, each with its own p, and zeros elsewhere."""
+    """Return the cotangent of a pencil: Σᵢ pᵢxᵢᵀ for the stiffness and for the mass, with one array p for each."""
     zeros = jax.tree.map(lambda like: jax.device_put(np.zeros(like.shape, like.dtype)), change)
     matrices = tuple(matrix.outer(each, x) for matrix, each in zip((zeros.stiffness, zeros.mass), p, strict=True))
     return eqx.tree_at(lambda pencil: (pencil.stiffness, pencil.mass), zeros, matrices)
 
 
 def _gaps(xp: Any, values: Any, k: int, rounding: Any) -> tuple[Any, Any]:
-    """Return the mask (k, p) of distinct pairs λᵢ, λⱼ (i ≤ k), and 1/(λᵢ − λⱼ), or 0 if they count as equal."""
+    """Return the mask (k, p) of eigenvalues λᵢ and λⱼ that count as distinct, and 1/(λᵢ − λⱼ), or 0 if they do not."""
     gap, above = values[:k, None] - values[None], values - xp.nanmin(values)
     least = xp.sqrt(xp.finfo(values.dtype).eps) * xp.maximum(above[:k, None], above[None])
     apart = xp.abs(gap) > xp.maximum(least, rounding)
@@ -185,14 +186,15 @@ def tangents_of(
 ) -> tuple[OfRows, Rows, Rows]:
     """Return dλ, dφ and the derivative of the frame for the first k of p computed pairs.
 
-    ``prepared`` is the result of `Adjoint.prepare`. ``functions`` are the first k vectors again, which saves a copy.
+    ``prepared`` is the result of `Adjoint.prepare`. ``functions`` are the first k vectors; a slice of ``vectors`` would
+    be a copy.
     """
     k = len(functions)
     eigenvalues, guards = values[:k], vectors[k:]
     moved = change.mass.apply(functions)
     force = change.stiffness.apply(functions) - eigenvalues[:, None] * moved
     apart, inverse = _gaps(jnp, values, k, indistinct(pencil, values.dtype))
-    # The guards have a separate product, because reverse mode of the frame needs only this one.
+    # The product with the guards is separate, because reverse mode of the frame needs only that product.
     into = inner_products(functions, force)
     within = jnp.where(apart[:, :k], inverse[:, :k] * into, -inner_products(functions, moved) / 2)
 
@@ -205,16 +207,16 @@ def tangents_of(
 
     frame = with_transpose(onto_guards, onto_guards, force)
     if _solves(pencil, k, len(values)):
-        # The force is zero on null vectors that every perturbation annihilates. In reverse mode, these rows are
-        # cotangents; then their solutions are set to zero. The identity stands for the product with the matrix,
-        # because JAX uses this product only for second derivatives.
+        # The force is zero for null vectors that every perturbation annihilates. In reverse mode, the rows of these
+        # null vectors are cotangents, so their solutions are set to zero. JAX uses the product with the matrix only for
+        # second derivatives; here the identity replaces this product.
         free = np.arange(k)[:, None] >= pencil.n_fixed
         rhs = jnp.where(free, -force, 0)
         frame = frame + jnp.where(free, jax.lax.custom_linear_solve(lambda x: x, rhs, solve, symmetric=True), 0)
     return jnp.diagonal(into), matmul(within, functions) + frame, frame
 
 
-# `one_by_one` needs the same function object in every call; so these are module functions, not methods.
+# `one_by_one` needs the same function object in every call; so the next two are module functions, not methods.
 def _lowest(solver: Eigensolver, k: int, report: Report, pencil: SymmetricPencil) -> RawPairs:
     return solver.lowest(pencil, k, report)
 
@@ -224,7 +226,7 @@ def _prepare(adjoint: Adjoint, k: int, pencil: SymmetricPencil, values: Values) 
 
 
 def _checked(on_failure: OnFailure, x: Rows) -> Rows:
-    """Return x; if rows of x are NaN, warn or raise."""
+    """Return the solutions x; if rows of x are NaN, also warn or raise as ``on_failure`` says."""
     failed = jnp.sum(jnp.any(jnp.isnan(x), axis=1))
     if on_failure == "error":
         return eqx.error_if(x, failed > 0, unsolved("some", len(x)))
@@ -241,7 +243,7 @@ def _checked(on_failure: OnFailure, x: Rows) -> Rows:
 
 @numpy_where_known(jit_quickly())
 def _with_null_modes(xp: Any, mass: Any, nulls: Any, values: Any, vectors: Any) -> tuple[Any, Any]:
-    """Replace the solver's approximations of the null vectors by the known null vectors.
+    """Replace the solver's approximations of null vectors by the pencil's null vectors.
 
     Their eigenvalue becomes exactly 0 instead of about ±1e-13. Other vectors become orthogonal to the null vectors.
     """
@@ -249,7 +251,7 @@ def _with_null_modes(xp: Any, mass: Any, nulls: Any, values: Any, vectors: Any) 
     inverse_cholesky: Any
     if xp is jnp:
         product, inverse_cholesky = matmul, lapack.inverse_cholesky
-        nulls = jax.lax.optimization_barrier(nulls)  # else XLA would fold long constants during compilation
+        nulls = jax.lax.optimization_barrier(nulls)  # otherwise XLA would fold long constants during compilation
     else:
         product, inverse_cholesky = np.matmul, lambda gram: np.linalg.inv(np.linalg.cholesky(gram))
     nulls = nulls[: values.size]
@@ -267,9 +269,10 @@ def _with_null_modes(xp: Any, mass: Any, nulls: Any, values: Any, vectors: Any) 
 
 @jax.custom_jvp
 def frame_of_chosen(vectors: Rows, mass: Operator, chosen: Bool[Array, " k"]) -> Rows:
-    """Return the vectors, whose derivative excludes rotations among the chosen ones (a frame of the chosen vectors).
+    """Return the vectors, with a derivative that excludes rotations of the chosen vectors among themselves.
 
-    A frame of all vectors would also exclude rotations towards vectors that are not chosen.
+    The result is a frame of the chosen vectors. A frame of all vectors would also exclude rotations towards vectors
+    that are not chosen.
     """
     return vectors
 
@@ -284,7 +287,7 @@ def _frame_of_chosen_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]
 
 # The transpose derived by JAX would multiply by the transposed vectors, which takes twice as long.
 def products_with_constants(images: Float[Array, "b n_dof"], vectors: Rows) -> Float[Array, "b k"]:
-    """Return the inner products, for derivatives linear in the images; the vectors are constants."""
+    """Return the inner products of images and vectors; derivatives treat the vectors as constants."""
     return with_transpose(partial(inner_products, vectors), lambda mix: matmul(mix, vectors), images)
 
 
@@ -292,13 +295,13 @@ def products_with_constants(images: Float[Array, "b n_dof"], vectors: Rows) -> F
 def of_simple(
     vectors: Rows, values: OfRows, following: Scalar, kept: Bool[Array, " k"], part: Any, pencil: AnyPencil
 ) -> Rows:
-    """Return the vectors. Their nonzero derivatives become NaN unless the eigenvalue is simple and kept."""
+    """Return the vectors. A nonzero derivative of a vector becomes NaN unless its eigenvalue is simple and kept."""
     return vectors
 
 
-# The derivative of Σᵢ f(λᵢ) φᵢ(x)² contains Gᵢⱼ f'(λ) φᵢ φⱼ for equal eigenvalues λᵢ = λⱼ = λ. The derivatives of the
-# f(λᵢ) give only the diagonal terms. Rotations among these φᵢ cancel, because the f(λᵢ) are equal. So no finite dφᵢ
-# makes the sum correct.
+# For equal eigenvalues λᵢ = λⱼ = λ, the derivative of Σᵢ f(λᵢ) φᵢ(x)² contains f'(λ) φᵢ φⱼ φᵢᵀ(dK − λ dM)φⱼ. The
+# derivatives of the f(λᵢ) give only the terms with i = j. Rotations among these φᵢ cancel, because the f(λᵢ) are equal.
+# So no finite dφᵢ makes the derivative correct.
 @of_simple.defjvp
 def _of_simple_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     vectors, values, following, kept, part, pencil = primals
@@ -313,7 +316,7 @@ def _of_simple_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 @numpy_where_known(static_argnums=5)
 def _is_multiple(xp: Any, values: Any, following: Any, kept: Any, part: Any, rounding: Any, fixed: bool) -> Any:
-    """Return the mask (k) of pairs that are not kept, cut by k, or mixed with an equal eigenvalue by perturbations."""
+    """Return the mask (k) of pairs that are not kept or whose eigenvalue is multiple, except fixed null vectors."""
     size = xp.maximum(xp.abs(values), values - values[:1])
     least = xp.maximum(xp.finfo(values.dtype).eps ** 0.5 * size, xp.max(xp.stack(rounding)))
     near = xp.abs(values[:, None] - values[None]) <= least[:, None]

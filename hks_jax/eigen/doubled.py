@@ -1,4 +1,4 @@
-"""Eigenpairs of a doubled domain: the problems of its parts are solved and their spectra merged."""
+"""Eigenpairs of a doubled domain: the problems of its parts are solved, and their spectra are merged."""
 
 import math
 import time
@@ -23,16 +23,16 @@ def solve_doubled(
 ) -> Eigenpairs:
     """Solve all parts and return the k lowest pairs of the merged spectrum; ``extra`` = 1 adds the next eigenvalue.
 
-    The number of pairs from each part is not known beforehand. If values are concrete, the first guess is an equal
-    share plus a margin, doubled for every part that may still miss a pair; otherwise the upper bound is used. By Weyl's
-    law, the boundary conditions of the parts change their shares by about the square root of the total.
+    The number of pairs from each part is not known beforehand. For traced values, it is the upper bound from `_limits`.
+    For concrete values, it begins with an equal share plus a margin, and is doubled while the part may lack a pair. By
+    Weyl's law, the parts' boundary conditions change their shares by about the square root of the total.
     """
     parts, total = pencil.parts, k + extra
     whole, limits = widened(pencil, solvers, total), _limits(pencil, total)
     traced = is_traced(jax.lax.stop_gradient(pencil))
     share = math.ceil(total / len(parts)) + 2 * math.isqrt(total) + 4
     wanted = limits if traced else [min(limit, share) for limit in limits]
-    # For a small part, all of its pairs may be needed, which an iterative solver cannot compute.
+    # All pairs of a small part may be needed, and an iterative solver cannot compute all pairs.
     solvers = [
         solver if limit <= solver.max_pairs(part.size) else Dense(solver.tolerance)
         for solver, part, limit in zip(solvers, parts, limits, strict=True)
@@ -57,13 +57,13 @@ def solve_doubled(
 
 
 def _limits(pencil: MirrorPencil, total: int) -> list[int]:
-    """Return, for each part, the largest possible number of pairs among the ``total`` lowest."""
+    """Return the largest number of pairs that each part can have among the ``total`` lowest."""
     shares = zip(pencil.including, pencil.parts, strict=True)
     return [min(max(total // len(including), 1), part.size) for including, part in shares]
 
 
 def _of_problem(report: Report, number: int, of: int) -> Report:
-    """Return a report that names the current problem; it assumes that each later problem takes as long."""
+    """Return a report function that names the current problem, and assumes that each later problem takes as long."""
     begin = time.perf_counter()
 
     def tell(text: str) -> None:
@@ -85,7 +85,7 @@ def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: i
     frames = [frame_of_chosen(p.vectors, part.mass, c) for p, part, c in zip(solved, pencil.parts, chosen, strict=True)]
 
     def together(rows: list[Float[Array, "_ _"]]) -> Float[Array, "k n_dof"]:
-        # An eigenfunction has unit norm on the domain doubled m times, hence norm 1/√2^m here.
+        # An eigenfunction has norm 1 on the domain doubled m times, hence norm 1/√2ᵐ on the domain itself.
         of_all = [pairs.space.transfer(own, pencil.space) for pairs, own in zip(solved, rows, strict=True)]
         return jnp.concatenate(of_all)[lowest] / math.sqrt(len(solved))
 
@@ -107,10 +107,11 @@ def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: i
     )
 
 
-# Let part B's trial functions include those of part A. Then the j-th eigenvalue of A is not below the j-th of B. If the
-# two are equal, rounding may swap them, and A would have more pairs than `MirrorPencil.including` allows.
+# Let part B's trial functions include those of part A. Then the j-th eigenvalue of A is not below the j-th eigenvalue
+# of B. If the two are equal, rounding may swap them; then A could have more pairs among the lowest than
+# `MirrorPencil.including` allows.
 def _sorted_by(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...]) -> list[Float[Array, " _"]]:
-    """Return each part's eigenvalues, raised to at least those of equal index of each part that includes it."""
+    """Return each part's eigenvalues; the j-th is raised to the j-th of every part that includes this part."""
     keys: list[Array] = []
     for pairs, including in zip(solved, pencil.including, strict=True):
         own = pairs.eigenvalues

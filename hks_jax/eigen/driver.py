@@ -47,23 +47,24 @@ def eigenpairs(
             (K, M). `sparse_pencil` describes the accepted matrices.
         k: the number of pairs, from 1 to the number of degrees of freedom. With an interval, leave k out; but if values
             are traced, k must be the number of eigenvalues in the interval (`count_eigenvalues`).
-        boundary: see `assemble`; a given pencil already has it.
-        solver: ``"auto"`` (chosen by size; under `jit`, `vmap` and on accelerators never on the host), ``"dense"``,
-            ``"shift-invert"`` (on the host), ``"block-lanczos"`` (mainly for 2D and surfaces), ``"chebyshev-filter"``
-            (for grids, mainly in 3D), or a solver object such as ``hks_jax.BlockLanczos(tolerance=1e-6)``. The result
-            names the solver in ``.solver_name``. An interval, or a stiffness that may be indefinite, needs ``"dense"``
-            or ``"block-lanczos"``; for such a stiffness with concrete values, ``"shift-invert"`` works too. Derivatives
-            in an interval use only the tolerance of the solver's ``adjoint``.
-        mass: ``"consistent"`` or ``"lumped"``; a given pencil already has it.
+        boundary: see `assemble`. Only for fields and meshes.
+        solver: ``"auto"`` (chosen by size, but never a solver on the host under `jit`, `vmap` or on accelerators),
+            ``"dense"``, ``"shift-invert"`` (on the host), ``"block-lanczos"`` (mainly for 2D and surfaces),
+            ``"chebyshev-filter"`` (for grids, mainly in 3D), or a solver object such as
+            ``hks_jax.BlockLanczos(tolerance=1e-6)``. The result names the solver in ``.solver_name``. An interval, or a
+            stiffness that may be indefinite, needs ``"dense"`` or ``"block-lanczos"``; for such a stiffness with
+            concrete values, ``"shift-invert"`` works too. Derivatives in an interval use only the tolerance of the
+            solver's ``adjoint``.
+        mass: ``"consistent"`` or ``"lumped"``. Only for fields and meshes.
         multiplet: the treatment of a multiple eigenvalue that k cuts; an interval cuts none. ``"report"`` warns.
             ``"drop"`` excludes its pairs from every signature. ``"complete"`` computes 8 additional pairs and includes
             the missing ones, or drops the eigenvalue if 8 are too few. ``.kept`` marks the included pairs.
-        throw: whether to raise an error if ``.result`` is not successful or derivatives do not converge, also under
-            `jit`, by a callback to the host. Otherwise ``.result`` has the code and derivatives are NaN; concrete
-            values also cause a warning.
+        throw: whether to raise an error if ``.result`` is not successful or derivatives do not converge; under `jit`, a
+            callback to the host raises it. Otherwise ``.result`` has the error's code, and derivatives that did not
+            converge are NaN; concrete values also cause a warning.
         progress: a function such as ``print`` that receives short texts during a computation with concrete values.
         interval: (a, b), to compute all eigenpairs with a ≤ λ < b instead of the lowest.
-        quadrature: see `assemble`; a given pencil already has it.
+        quadrature: see `assemble`. Only for fields and meshes.
 
     Returns:
         The pairs with residuals and convergence flags. The eigenvalue of a null vector is exactly zero. (Each component
@@ -120,24 +121,23 @@ def eigsh(
     throw: bool = False,
     progress: Report | None = None,
 ) -> Eigenpairs:
-    """Compute the lowest eigenpairs of a sparse symmetric pencil, or all in an interval, and prove that none is missed.
+    """Compute the lowest eigenpairs of a sparse symmetric pencil, or all in an interval, and certify completeness.
 
-    ``eigsh(K, M, k)`` is ``eigenpairs(sparse_pencil(K, M), k)``. The function corresponds to
+    ``eigsh(K, M, k)`` equals ``eigenpairs(sparse_pencil(K, M), k)``. The function corresponds to
     `scipy.sparse.linalg.eigsh` with ``which="LM"`` and ``sigma`` below the spectrum, but needs no shift. K may be
     singular, with any null space, or indefinite. Eigenvectors are the *rows* of ``.vectors``. Multiple eigenvalues are
     found with their full multiplicity. If values are traced, an eigenvalue of multiplicity above about forty may lack
     pairs; then ``.result`` is not successful. For the largest eigenvalues, negate K; for interior eigenvalues, give the
     interval. A ``LinearOperator`` is not accepted, because K and M are factorised (by nested dissection).
 
-    First derivatives with respect to the entries of K and M are available in forward and reverse mode. For eigenvalues
-    of any multiplicity, derivatives of signatures are exact, and of sums over all copies of an eigenvalue. The
-    derivative of an eigenvector is NaN if its eigenvalue is multiple; so use `spectral_signature`, not your own Σᵢ
-    f(λᵢ) φᵢ(x)². The function works under `jit`, and under `vmap` over the entries of one pattern (map over a pencil
-    from `sparse_pencil`). Derivatives in an interval keep its ends fixed.
+    Derivatives with respect to the entries of K and M are those of `eigenpairs`. The derivative of an eigenvector is
+    NaN if its eigenvalue is multiple; so do not sum f(λᵢ) φᵢ(x)² yourself, but use `spectral_signature`. The function
+    works under `jit`, and under `vmap` over pencils from `sparse_pencil` that share a sparsity pattern. Derivatives in
+    an interval keep its ends fixed.
 
     Args:
         K: a symmetric (n, n) matrix: a SciPy sparse matrix, a BCOO or BCSR of `jax.experimental.sparse`, an operator of
-            this package, or a full array. K may also be a pencil from `sparse_pencil` or `assemble`, without M.
+            this package, or a dense array. K may also be a pencil from `sparse_pencil` or `assemble`, without M.
         M: a symmetric positive definite matrix of such a type, or its diagonal (n,); None is the identity.
         k: the number of pairs, from 1 to n. See `eigenpairs` for k with an interval.
         interval: (a, b), to compute all eigenpairs with a ≤ λ < b.
@@ -149,7 +149,7 @@ def eigsh(
         The pairs with residuals, convergence flags and the certificate. All signatures accept them.
 
     Raises:
-        ValueError: `sparse_pencil` or `eigenpairs` refuses an argument.
+        ValueError: `sparse_pencil` or `eigenpairs` does not accept an argument.
         RuntimeError: the computation failed and ``throw`` is set.
 
     Warns:
@@ -192,7 +192,9 @@ def _in_interval(
     report: Report,
 ) -> Eigenpairs:
     if len(pencil.parts) > 1 and k is not None:
-        raise ValueError(f"k: got {k} with an interval of a doubled domain, which has two separate counts; leave k out")
+        raise ValueError(
+            f"k: got {k} with an interval of a doubled domain, whose parts have separate counts; leave k out"
+        )
     checked = [checked_interval(part, interval, k) for part in jax.lax.stop_gradient(pencil).parts]
     solvers = [_for_interval(solver, part, each) for part, each in zip(pencil.parts, checked, strict=True)]
     traced = is_traced([each.below for each in checked])

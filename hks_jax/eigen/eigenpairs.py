@@ -40,33 +40,35 @@ class Eigenpairs(eqx.Module):
     """The k lowest eigenpairs of Kφ = λMφ, or those in an interval; a pytree.
 
     The derivatives of signatures with respect to the matrices use `pencil` and `frame`, not `eigenvalues` and
-    `vectors`. So do not rescale these arrays: their replacements would be differentiable only with respect to
-    themselves. Rescale times or the pencil instead.
+    `vectors`. So do not rescale these arrays: derivatives of signatures would then refer to the new arrays, not to the
+    matrices. Rescale times or the pencil instead.
 
     Attributes:
         eigenvalues: (k,) in ascending order, in 1/(metric length)²; exactly 0 for null vectors.
-        vectors: (k, n_dof) coefficients of the eigenfunctions, with φᵢᵀMφⱼ = δᵢⱼ. Under "mirror" and "mean" this holds
-            on the doubled domain; so each doubling divides the norm here by √2.
-        frame: (k, n_dof) the same values as `vectors`, but another derivative. The derivative excludes rotations of the
-            eigenfunctions among themselves, which are singular at multiple eigenvalues and irrelevant to signatures.
+        vectors: (k, n_dof) coefficients of the eigenfunctions, with φᵢᵀMφⱼ = δᵢⱼ. Under "mirror" and "mean", this holds
+            on the doubled domain; so each doubling divides the norm on the domain itself by √2.
+        frame: (k, n_dof) the same values as `vectors` with another derivative, which excludes rotations of the
+            eigenfunctions among themselves. These rotations are singular at multiple eigenvalues and irrelevant to
+            signatures.
         residuals: (k,) ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁), where λ₁ is the first positive eigenvalue. In an interval, or if
             the null space is unknown, max(λ, λ₁) is replaced by the distance of λ from `spectral_origin`, but at least
             by the mean gap of the eigenvalues.
         converged: (k,) whether the residual is at most the solver's tolerance, or the level of rounding if larger.
-        kept: (k,) whether each pair belongs to the truncated spectrum. This is false only for the last pairs, if a
-            multiple eigenvalue that k cuts was dropped or completed; signatures then exclude these pairs.
+        kept: (k,) whether each pair belongs to the truncated spectrum; signatures ignore the other pairs.
+            ``multiplet="drop"`` and ``"complete"`` may exclude the last pairs, and `of_part` the pairs of the other
+            parts.
         part: (k,) under "mirror" and "mean" the index of the pencil's part that each pair belongs to (0 is the Neumann
             problem); otherwise None.
-        next_eigenvalue: the first eigenvalue not kept; infinite if there is none or if it was not computed, as for an
-            interval. Derivatives treat it as a constant.
+        next_eigenvalue: the first eigenvalue that is not kept; infinite if it does not exist or was not computed, as
+            for an interval. Derivatives treat it as a constant.
         complete_below: the solver's certificate that it missed no eigenvalue below this bound (in an interval, none
-            between the lower end and the bound). The certificate follows from Sylvester's law of inertia, or all
-            eigenvalues were computed. NaN if there is no certificate. Derivatives treat it as a constant.
+            between the lower end and the bound). The certificate follows from Sylvester's law of inertia, or from the
+            computation of all eigenvalues. NaN if there is no certificate. Derivatives treat the bound as a constant.
         spectral_origin: the reference point of relative errors: 0 if K ⪰ 0 is known, otherwise the lowest eigenvalue;
             for an interval its lower end.
         multiplet_tolerance: the gap, relative to the distance from `spectral_origin`, below which neighbouring
             eigenvalues count as equal.
-        pencil: the matrices.
+        pencil: the matrices K and M.
         solver_name: the name of the solver.
         lowest: whether the pairs are the lowest; false for an interval.
     """
@@ -122,7 +124,7 @@ class Eigenpairs(eqx.Module):
         if pencil is self.pencil:
             return self
         vectors = self.space.transfer(self.vectors, pencil.space)
-        # The frame has the same values, and is transferred separately only for its derivative.
+        # The frame has the same values as the vectors; a separate transfer is needed only for its derivative.
         frame = self.space.transfer(self.frame, pencil.space) if is_traced(self.frame) else vectors
         return eqx.tree_at(lambda p: (p.vectors, p.frame, p.pencil), self, (vectors, frame, pencil))
 
@@ -148,13 +150,6 @@ class Eigenpairs(eqx.Module):
                 "null vectors"
             )
         return int((values == 0).sum())
-
-    @property
-    def last_eigenvalue(self) -> Float[Array, ""]:
-        """The largest kept eigenvalue; NaN if there are no pairs."""
-        if not self.k:
-            return jnp.asarray(np.nan, self.eigenvalues.dtype)
-        return _last(self.eigenvalues, self.kept)
 
     @property
     def cut_multiplet(self) -> Array:
@@ -184,7 +179,7 @@ class Eigenpairs(eqx.Module):
         return code.where(jnp.all(jnp.stack(finite)), result, code.not_finite)
 
     def messages(self) -> list[str]:
-        """Return sentences that describe the defects of these pairs, if any. Needs concrete values."""
+        """Return sentences that describe defects of these pairs. Needs concrete values."""
         if not self.k:
             return []
         other = "allow more restarts" if "shift-invert" in self.solver_name else "another solver"
@@ -193,10 +188,10 @@ class Eigenpairs(eqx.Module):
         sentences, last = [], values[kept - 1]
         if bad.any():
             missing, worst = int(np.isnan(values).sum()), np.nanmax(np.asarray(self.residuals)[bad], initial=0.0)
-            found = f"; the worst relative residual of those found is {worst:.1e}" if missing < bad.sum() else ""
+            found = f"; the largest relative residual of the others is {worst:.1e}" if missing < bad.sum() else ""
             better = "" if values.dtype == np.float64 else "float64, "
             sentences.append(
-                f"{int(bad.sum())} of {values.size} eigenpairs did not converge ({missing} of them not found{found}) "
+                f"{int(bad.sum())} of {values.size} eigenpairs did not converge ({missing} were not found{found}) "
                 f"with the {self.solver_name} solver. Use {better}fewer pairs, or {other}"
             )
         if bool(self.unconfirmed):
@@ -215,7 +210,7 @@ class Eigenpairs(eqx.Module):
         stretch = _anisotropy(self.pencil) if values.dtype == np.float32 else 1.0
         if (rounding := np.finfo(np.float32).eps * stretch) > _ROUNDED:
             sentences.append(
-                f"the tensors stretch up to {stretch:.1e} times more along one axis than another: rounding them to "
+                f"the ratio of a tensor's eigenvalues is up to {stretch:.1e}: rounding such tensors to "
                 f"float32 changes eigenvalues by up to {rounding:.0e}, which residuals do not show. Use float64"
             )
         return sentences
@@ -226,7 +221,7 @@ class Eigenpairs(eqx.Module):
             return "no eigenpairs: the interval contains no eigenvalue"
         values, residuals = np.asarray(self.eigenvalues), np.asarray(self.residuals)
         kept, following = int(np.asarray(self.kept).sum()), float(self.next_eigenvalue)
-        last = float(self.last_eigenvalue)
+        last = values[kept - 1]
         lines = [
             f"{self.k} eigenpairs of {sum(p.space.n_dof for p in self.pencil.parts)} by {self.solver_name}",
             f"eigenvalues {values[0]:.6g} … {last:.6g} ({self.n_null} zero; the next is {following:.6g})",
@@ -241,7 +236,7 @@ class Eigenpairs(eqx.Module):
 
 
 def _anisotropy(pencil: AnyPencil | None) -> float:
-    """Return a high quantile of the eigenvalue ratios of a sample of the grid's tensors; 1 without a grid."""
+    """Return a high quantile of the tensors' eigenvalue ratios in a sample of the grid; 1 without a grid."""
     metric = None if pencil is None else pencil.parts[0].metric
     if metric is None or metric.spacing is None or not getattr(metric.tensors, "is_fully_addressable", True):
         return 1.0
@@ -255,14 +250,9 @@ def _anisotropy(pencil: AnyPencil | None) -> float:
 
 
 def multiplet_gap(xp: Any, values: Any, origin: Any, tolerance: Any) -> Any:
-    """Return the largest gaps (*k) to the next eigenvalues at which these count as equal; by NumPy or JAX."""
+    """Return the largest gap between each eigenvalue and the next at which the two count as equal, (*k)."""
     finfo = jnp.finfo(values.dtype)
     return tolerance * xp.maximum(xp.maximum(values - origin, finfo.eps * xp.abs(values)), finfo.tiny)
-
-
-@numpy_where_known()
-def _last(xp: Any, values: Any, kept: Any) -> Any:
-    return values[xp.sum(kept) - 1]
 
 
 @numpy_where_known(static_argnums=5)

@@ -31,11 +31,11 @@ _BESIDE = (1e-6, 1e-5, 1e-4, 1e-3)
 _TRIES = 60
 """The maximal number of factorisations in a search."""
 _JUST_BELOW = 0.625
-"""The exponent of ε in the relative distance below zero at which a count is accurate even if K is singular."""
+"""The exponent of ε in the relative distance below zero at which a count is accurate, even if K is singular."""
 _ALIKE = 1e-3
-"""The relative width of a bracket below which the eigenvalues in it count as one multiple eigenvalue."""
+"""The relative width of a bracket below which all of its eigenvalues count as one multiple eigenvalue."""
 _NARROW = 8
-"""The width of a bracket, in units of the distance below zero of the first count, at which division stops."""
+"""The width at which a bracket is not divided further, in units of the distance of the first shift from zero."""
 
 Scalar = Float[Array, ""]
 Number = Int[Array, ""]
@@ -57,15 +57,15 @@ def count_eigenvalues(
     Args:
         domain: a tensor field, a mesh, a pencil, K, or (K, M), as in `eigenpairs`.
         below: σ, in 1/(metric length)². The count is uncertain if σ is an eigenvalue.
-        boundary: see `assemble`; a given pencil already has it.
-        mass: see `assemble`; a given pencil already has it.
+        boundary: see `assemble`. Only for fields and meshes.
+        mass: see `assemble`. Only for fields and meshes.
 
     Returns:
         The number of eigenvalues less than σ; −1 if values are traced and the number is uncertain.
 
     Raises:
         ValueError: σ is not finite, or too close to an eigenvalue (the message has the counts on both sides);
-            `eigenpairs` refuses the domain.
+            `eigenpairs` does not accept the domain.
 
     Examples:
         >>> print(hj.count_eigenvalues(field, 20.0), (pairs.eigenvalues < 20.0).sum())
@@ -76,7 +76,7 @@ def count_eigenvalues(
 
 
 def checked_pencil(domain: Any, boundary: BoundarySpec, mass: MassKind, quadrature: Quadrature = "gauss") -> AnyPencil:
-    """Return the pencil of a user's domain. If the user gave a concrete M, check that M is positive definite."""
+    """Return the pencil of a user's domain. If the user's M is concrete, check that it is positive definite."""
     pencil = pencil_of(domain, boundary, mass, quadrature)
     for part in jax.lax.stop_gradient(pencil).parts:
         own = isinstance(part.space, MatrixSpace) or part.volume is None
@@ -88,7 +88,7 @@ def checked_pencil(domain: Any, boundary: BoundarySpec, mass: MassKind, quadratu
         if int(negative) or not sound:
             what = f"{int(negative)} negative eigenvalue(s)" if sound else "an eigenvalue that is zero within rounding"
             name = "M" if isinstance(part.space, MatrixSpace) else "mass"
-            raise ValueError(f"{name}: got a matrix with {what} by its inertia; expected a positive definite one")
+            raise ValueError(f"{name}: got a matrix with {what} by its inertia; expected a positive definite matrix")
     return pencil
 
 
@@ -130,7 +130,7 @@ def certain_count(pencil: SymmetricPencil, shift: Scalar) -> Count:
     return _certain_count(pencil, dissect(pencil.pattern), shift)
 
 
-# The dissection is an argument, because XLA would process a constant (74 MB at 1024² nodes) during compilation.
+# The dissection is an argument, because compilation would process a constant of this size (74 MB at 1024² nodes).
 @jit_quickly()
 def _certain_count(pencil: SymmetricPencil, dissection: Dissection, shift: Scalar) -> Count:
     factor, trial, _ = certain_factorisation(dissection, pencil, shift)
@@ -141,20 +141,20 @@ class LocatedPencil(SymmetricPencil):
     """The pencil of K − σ₀M and M, with counts of its spectrum near the origin σ₀. Its null space is unknown."""
 
     negative: Number  # the number of eigenvalues below the origin
-    first: Scalar  # the first shift: about the requested number of eigenvalues lie between the origin and it
+    first: Scalar  # the first shift; about the requested number of eigenvalues lie between it and the origin
     spacing: Scalar  # the mean gap of eigenvalues between the origin and `first`
 
 
 def translated(
     pencil: SymmetricPencil, origin: Scalar, negative: Number, first: Scalar, spacing: Scalar
 ) -> LocatedPencil:
-    """Return the pencil whose eigenvalues are counted from the origin."""
+    """Return the pencil of K − σ₀M and M, where σ₀ is the origin, with counts of its spectrum near σ₀."""
     moved = pencil.stiffness.with_flat(pencil.shifted(jax.lax.stop_gradient(origin)))
     return LocatedPencil(moved, pencil.mass, *jax.lax.stop_gradient((negative, first, spacing)))
 
 
 class _Descent(NamedTuple):
-    """The state of a search below an origin: the eigenvalues within several distances were counted."""
+    """The state of the search for a distance below the origin that contains about as many eigenvalues as allowed."""
 
     near: Scalar  # the largest distance so far that has at most the allowed number of eigenvalues; 0 at first
     number: Number  # the number of eigenvalues within `near`
@@ -165,7 +165,7 @@ class _Descent(NamedTuple):
 
 
 def lowered(pencil: LocatedPencil, most: int, probes: int) -> tuple[Scalar, Number]:
-    """Return a distance by which to lower an origin, and the number of eigenvalues passed: `most`/2 to `most`.
+    """Return a distance below the origin, and the number of eigenvalues within this distance: `most`/2 to `most`.
 
     The number is smaller if no more eigenvalues exist, or if a multiple eigenvalue follows that would exceed `most`.
     Each factorisation is tested with `probes` random right-hand sides.
@@ -202,14 +202,14 @@ class _Search(NamedTuple):
     low: Scalar  # the highest shift so far with no eigenvalue below it; −∞ at first
     high: Scalar  # the lowest shift so far with eigenvalues below it; ∞ at first
     number: Number  # the number of eigenvalues below `high`
-    first: Scalar  # the highest shift with this number below it: solves are most accurate far from eigenvalues
+    first: Scalar  # the highest shift with `number` eigenvalues below it: far from them, solves are most accurate
     next: Scalar  # the next shift to count at
     tries: Number  # the number of counts so far
     going: Flag  # whether the search goes on
 
 
 def locate(pencil: SymmetricPencil, wanted: int, probes: int) -> tuple[Scalar, Scalar, Number]:
-    """Return an origin below all eigenvalues, a number above the lowest 1 … 2·wanted of them, and their number.
+    """Return an origin below all eigenvalues, a shift above the lowest 1 to 2·wanted of them, and their number.
 
     A bracket is halved, or divided in proportion to the counts, until it contains few enough eigenvalues. Each
     factorisation is tested with `probes` random right-hand sides. If many eigenvalues are equal within rounding, the
@@ -265,7 +265,7 @@ def _counting(pencil: SymmetricPencil, probes: int) -> Callable[[Scalar], Count]
 
 
 def dissected(pencil: SymmetricPencil) -> Dissection:
-    """Return the elimination tree; if values are concrete, its arrays are put on the device."""
+    """Return the elimination tree of a pencil, with its arrays on the device if values are concrete."""
     dissection = dissect(pencil.pattern)
     return dissection if is_traced(pencil) else jax.device_put(dissection)
 

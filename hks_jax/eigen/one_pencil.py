@@ -31,7 +31,7 @@ _FAR = 30
 
 
 def widened(pencil: AnyPencil, solvers: Sequence[Eigensolver], k: int) -> AnyPencil:
-    """Return the pencil `on_all_nodes`, so that all masks share one compilation; unchanged for the dense solver."""
+    """Return the pencil `on_all_nodes`, so that all masks share one compilation; but not for the dense solver."""
     return pencil if any(isinstance(solver, Dense) for solver in solvers) else on_all_nodes(pencil, k)
 
 
@@ -68,7 +68,8 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
         origin, first, below = locate(jax.lax.stop_gradient(pencil), half, solver.block)
         reach, spacing = first - origin, (first - origin) / jnp.maximum(below, 1).astype(origin.dtype)
         if not is_traced(below) and below > 2 * half:
-            # If the lowest eigenvalue has a multiplicity above k, compute all its pairs, as `locate` counted all.
+            # The lowest eigenvalue has a higher multiplicity than expected. Compute all its pairs, because `locate`
+            # counted them.
             number = max(k, int(below))
             method = solver if number + 1 <= solver.max_pairs(n_dof) else Dense(solver.tolerance)
 
@@ -83,8 +84,8 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
     values = jax.lax.stop_gradient(found[0])
     spread = values[-1] - values[0]
     if not is_traced(values) and spread > indistinct(moved, values.dtype) and values[0] > _FAR * spread:
-        # Solve again from an origin nearer to the spectrum, because distances from a remote origin lose digits; equal
-        # eigenvalues have none to lose.
+        # Solve again from an origin nearer to the spectrum, because distances from a remote origin have fewer correct
+        # digits. For equal eigenvalues, this does not matter.
         origin = origin + values[0] - spread
         moved, found = solve(origin, 2 * spread, spread / number)
     if number > k:
@@ -145,7 +146,7 @@ def checked_interval(pencil: Pencil, interval: tuple[float, float], k: int | Non
     available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if needed > available:
         raise ValueError(
-            f"interval: got an interval of {count} eigenpairs, which need about {needed / 1e9:.3g} GB; the machine "
+            f"interval: got one with {count} eigenpairs, which need about {needed / 1e9:.3g} GB; the machine "
             f"has {available / 1e9:.3g} GB. Divide the interval"
         )
     return Interval(low, high, below, held, count)
@@ -159,7 +160,7 @@ def _pairs(
     solver: Eigensolver,
     lowest: bool = True,
 ) -> Eigenpairs:
-    """Return the `Eigenpairs` of a pencil, given the pairs of the pencil translated to an origin."""
+    """Return the `Eigenpairs` of a pencil, given the pairs of K − σ₀M and M for an origin σ₀."""
     values, vectors, frame, following, bound = found
     known = solved_pencil is pencil and pencil.null_space is not None
     if values.size:

@@ -22,10 +22,11 @@ _ROWS = 8
 def measure_pairs(
     pencil: SymmetricPencil, vectors: Float[Array, "m n_dof"], values: Float[Array, " m"] | None = None
 ) -> tuple[Float[Array, " m"], Float[Array, " m"], Bool[Array, " m"]]:
-    """Return λ, ‖Kφ − λMφ‖ / ‖Mφ‖, and whether a vector is nearly parallel to one of the few before it (found twice).
+    """Return λ, ‖Kφ − λMφ‖ / ‖Mφ‖, and whether φ was found twice.
 
-    If eigenvalues are not given, they are the Rayleigh quotients φᵀKφ / φᵀMφ, and vectors are not compared. In double
-    precision, vectors are never compared, because all solvers keep vectors orthogonal.
+    A vector counts as found twice if it is nearly parallel to one of the few vectors before it. If eigenvalues are not
+    given, they are the Rayleigh quotients φᵀKφ / φᵀMφ, and vectors are not compared. In double precision, vectors are
+    never compared, because all solvers keep vectors orthogonal.
     """
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
     m, size, width = len(vectors), min(_ROWS, len(vectors)), min(2 * _ROWS, len(vectors))
@@ -53,7 +54,7 @@ def measure_pairs(
 def measured_on_host(
     pencil: Any, vectors: Float[np.ndarray, "m n_dof"], values: Float[np.ndarray, " m"]
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
-    """Return the result of `measure_pairs` for a pencil of SciPy matrices; vectors are compared with all before."""
+    """Return the result of `measure_pairs` for SciPy matrices; each vector is compared with all vectors before it."""
     columns = np.ascontiguousarray(vectors.T)
     image = pencil.mass.tocsr() @ columns
     force = pencil.stiffness.tocsr() @ columns
@@ -79,13 +80,18 @@ def indistinct(pencil: SymmetricPencil, dtype: np.dtype) -> Float[Array, ""]:
 
 
 def largest(pencil: SymmetricPencil) -> Float[Array, ""]:
-    """Estimate the largest eigenvalue by 4·max|Kᵢᵢ/Mᵢᵢ|, which is λ_max on a uniform grid in 2D and 3D."""
+    """Estimate the largest eigenvalue by 4·max|Kᵢᵢ/Mᵢᵢ|, which is λ_max on a uniform grid in 2D and 3D.
+
+    If the diagonal of K is small, as of an adjacency matrix, the estimate is the mean of Σⱼ|Kᵢⱼ|, divided by max Mᵢᵢ.
+    """
     return _largest(pencil.stiffness, pencil.mass)
 
 
 def largest_of(xp: Any, stiffness: Any, mass: Any) -> Any:
     """Return the result of `largest` for matrices of JAX or SciPy."""
-    return 4 * xp.max(xp.abs(stiffness.diagonal()) / mass.diagonal())
+    masses, entries = mass.diagonal(), stiffness.data if xp is np else stiffness.flat()
+    mean = xp.sum(xp.abs(entries)) / masses.size / xp.max(masses)
+    return xp.maximum(4 * xp.max(xp.abs(stiffness.diagonal()) / masses), mean)
 
 
 _largest = numpy_where_known()(largest_of)

@@ -23,14 +23,14 @@ from hks_jax.linear.pencil import P, SymmetricPencil
 RawPairs = tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, ""]]
 
 Report = Callable[[str], Any]
-"""A function that receives short texts on the progress of a computation. Some of these are a `Status`."""
+"""A function that receives short texts on the progress of a computation. Some texts are of the class `Status`."""
 
 
 class Status(str):
     """A text on the progress of a computation, with an estimate of the remaining time.
 
     Attributes:
-        seconds_left: the estimate; None if there is none.
+        seconds_left: the estimate; None if it is unknown.
     """
 
     seconds_left: float | None
@@ -51,10 +51,10 @@ class Eigensolver(eqx.Module, Generic[P]):
 
     Attributes:
         name: the name of the method in reports.
-        indefinite: whether it supports an indefinite stiffness, or one with an unknown null space.
+        indefinite: whether the method supports a stiffness that is indefinite, or whose null space is unknown.
         adjoint: the linear solver for derivatives. The default supports every pencil that can be factorised.
         tolerance: the relative residual ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁) at which a pair counts as converged. If the
-            level of rounding is larger, it replaces the tolerance.
+            level of rounding is larger, it is used instead.
     """
 
     name: ClassVar[str]
@@ -125,7 +125,7 @@ def _on_host(
         factor = cholesky(mass, lower=True)
         half = solve_triangular(factor, stiffness, lower=True)
         reduced = solve_triangular(factor, half.T, lower=True)
-        few = 3 * k < n  # then bisection and relatively robust representations are faster
+        few = 3 * k < n  # for few pairs, LAPACK's driver `evr` is faster
         values, modes = eigh(reduced, subset_by_index=[0, k - 1]) if few else eigh(reduced, driver="evd")
         vectors = solve_triangular(factor, modes[:, :k], lower=True, trans="T")
     except (np.linalg.LinAlgError, ValueError):

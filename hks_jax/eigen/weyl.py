@@ -23,7 +23,7 @@ def weyl(count: float, volume: Any, dimension: int) -> Any:
 
 
 def weyl_number(values: Any, volume: float, dimension: int, rim: float = 0.0) -> Any:
-    """Estimate the number of eigenvalues below λ ≥ 0. ``rim``: natural minus Dirichlet measure of the rim."""
+    """Estimate the number of eigenvalues below λ ≥ 0; see `weyl_count`, and `rim_measure` for ``rim``."""
     if dimension == 2:
         return (volume * values + rim * values**0.5) / (4 * math.pi)
     return volume * values**1.5 / (6 * math.pi**2) + rim * values / (16 * math.pi)
@@ -34,21 +34,21 @@ def weyl_count(
 ) -> Float[np.ndarray, " n"]:
     """Estimate the number of eigenvalues below each of several values, by Weyl's law.
 
-    In 2D N(λ) ≈ (A λ ± L √λ)/4π, where A is the area and L the length of the rim. In 3D N(λ) ≈ V λ^(3/2)/6π² ± S λ/16π,
-    where V is the volume and S the area of the rim. The sign is plus for the natural part of the rim, and minus for the
-    Dirichlet part (Ivrii 1980). The rim of a mask is the staircase of element faces; its full length matters only if √λ
-    times the spacing is close to 1.
+    In 2D, N(λ) ≈ (A λ ± L √λ)/4π, where A is the area and L is the length of the boundary. In 3D, N(λ) ≈ V λ^(3/2)/6π²
+    ± S λ/16π, where V is the volume and S is the area of the boundary. The sign is plus for a natural boundary, and
+    minus for a Dirichlet boundary (Ivrii 1980). The boundary of a mask is the staircase of element faces; its full
+    length matters only if √λ times the spacing is close to 1.
 
     Args:
         problem: the result of `eigenpairs` or `assemble`, which has volume, dimension and boundary conditions.
         values: (n,) λ ≥ 0, in 1/(metric length)².
-        domain: the field or mesh of the problem, for the second term. None leaves the second term out.
+        domain: the field or mesh of the problem, which the second term needs. None omits the second term.
 
     Returns:
         (n,) estimates, as a NumPy array.
 
     Raises:
-        ValueError: λ is negative; the problem has a potential, or no volume; the domain is not that of the problem.
+        ValueError: λ is negative; the problem has a potential, or no volume; the domain does not belong to the problem.
 
     Examples:
         >>> print(hj.weyl_count(pairs, [20 * np.pi]).round(1))  # area · λ/4π
@@ -73,13 +73,13 @@ def weyl_count(
         nodes = (pencil.space.triangulation.n_vertices,)
     if shape != nodes:
         raise ValueError(f"domain: got shape {shape}; expected the problem's shape {nodes}")
-    # The parts of a doubled domain have opposite conditions on the rim where it was doubled.
+    # The parts of a doubled domain have opposite conditions on the boundary where the domain was doubled.
     rim = sum(rim_measure(domain, part.space) for part in pencil.parts)
     return weyl_number(numbers, float(volume), d, rim)
 
 
 def rim_measure(domain: TensorField | SimplicialMesh, space: FunctionSpace) -> float:
-    """Return the metric length (area in 3D) of the natural part of the rim minus that of the Dirichlet part."""
+    """Return the metric length (area in 3D) of the natural boundary minus the length of the Dirichlet boundary."""
     if not isinstance(domain, SimplicialMesh):
         assert isinstance(space, GridSpace)
         return sum(_grid_rim(domain, space, axis) for axis in range(space.dimension))
@@ -98,7 +98,7 @@ def _grid_rim(field: TensorField, space: GridSpace, axis: int) -> float:
     others = [a for a in range(d) if a != axis]
     tensors = np.asarray(field.domain_tensors, np.float64)[..., others, :][..., others]
     density = wrap_nodes(np.sqrt(np.linalg.det(tensors)), space.periodic)
-    # Integrate over each face by the trapezoidal rule; along the axis itself, indices remain those of nodes.
+    # Integrate over each face by the trapezoidal rule; along the axis, the index remains the index of a node.
     for a in others:
         n = density.shape[a]
         density = (density.take(range(n - 1), a) + density.take(range(1, n), a)) / 2

@@ -255,7 +255,7 @@ def test_rounds_in_steps_give_the_same_and_say_what_is_left(monkeypatch):
     monkeypatch.setattr(chebyshev_filter, "_LARGE", 0)
     stepwise = hj.eigenpairs(pencil, k, solver=solver, progress=told.append)
     np.testing.assert_allclose(stepwise.eigenvalues, whole.eigenvalues, rtol=1e-12, atol=1e-12)
-    assert any("% of it filtered" in text for text in told)
+    assert any("% of the products" in text for text in told)
     first, last = (next(text for text in told if f"round {i}" in text) for i in (1, 3))
     assert first.seconds_left is None  # nothing is known of its pace
     assert last.seconds_left > 0

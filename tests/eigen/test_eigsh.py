@@ -80,7 +80,7 @@ def test_all_in_an_interval(problem, solver):
     told = []
     pairs = hj.eigsh(K, M, interval=tuple(ends), solver=solver, progress=told.append)
     check(pairs, K, M, spectrum[first + 1 : last + 1])
-    assert solver is None or "eigenpairs, all below" in told[-1]
+    assert solver is None or "eigenpairs, and all eigenvalues below" in told[-1]
 
 
 def test_an_interval_without_eigenvalues():
@@ -301,6 +301,16 @@ def test_a_vector_found_twice_has_not_converged(rng):
     matrices = SimpleNamespace(stiffness=pencil.stiffness.to_scipy(), mass=pencil.mass.to_scipy())
     on_host = measured_on_host(matrices, np.asarray(vectors), np.asarray(pairs.eigenvalues))
     np.testing.assert_array_equal(on_host[2], twice)
+
+
+def test_rounding_with_a_zero_diagonal(rng):
+    """The level of rounding follows from all entries, because the diagonal of an adjacency matrix is zero."""
+    links = np.triu(rng.random((60, 60)) < 0.2, 1)
+    assert hj.eigsh((links + links.T).astype(np.float32), k=5).converged.all()
+    star = np.zeros((10, 10))
+    star[0, 1:] = star[1:, 0] = 1
+    with pytest.raises(ValueError, match=r"1 eigenvalues are below \S+ and 9 are below"):
+        hj.count_eigenvalues(star, 0.0)
 
 
 @pytest.mark.slow

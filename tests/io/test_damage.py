@@ -127,7 +127,7 @@ def test_complex_voxels_are_refused(tmp_path):
     nib = pytest.importorskip("nibabel")
     image = nib.Nifti1Image(np.ones((3, 3, 3, 6), np.complex64), AFFINE)
     nib.save(image, tmp_path / "c.nii.gz")
-    with pytest.raises(ValueError, match=r"c\.nii\.gz: got complex numbers"):
+    with pytest.raises(ValueError, match=r"c\.nii\.gz: got voxels of type complex64; expected real"):
         hj.io.read_tensors(tmp_path / "c.nii.gz", "fsl")
 
 
@@ -203,7 +203,7 @@ def test_members_that_a_damaged_list_hides(tmp_path):
     content[entries[0] + 32] = (
         content.index(b"PK\x05\x06") - entries[1]
     )  # the length of the first entry's comment: the next entry
-    with pytest.raises(ValueError, match=r"its end states 2 members, but it lists 1"):
+    with pytest.raises(ValueError, match=r"its end record states 2 members, but its list has 1"):
         load_npz(_written(tmp_path / "a.npz", content))
 
 

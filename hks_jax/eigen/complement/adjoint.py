@@ -39,7 +39,7 @@ Shifts = Float[Array, " groups"]
 SINGULAR = 1e-8
 """The gap, relative to the last eigenvalue, below which K − λᵢM counts as singular on the complement."""
 _LEAST = 100
-"""A row below this, in units of ε times its size before projection, counts as zero. Also the least tolerance in ε."""
+"""The least tolerance, and the norm below which a projected row counts as zero, both relative and in units of ε."""
 _FACTORISATION = 200
 """The cost of a factorisation in solves of one row: about 100, but doubled, because small rows take few steps."""
 _MOST_GROUPS = 16
@@ -50,10 +50,12 @@ _ROWS = 128
 class Adjoint(eqx.Module, Generic[P]):
     """A linear solver with K − λᵢM on the complement of the computed eigenvectors; all settings are static.
 
-    Every eigensolver has a default in its field ``adjoint``; any other that supports the pencil may replace it.
+    Every eigensolver has a default in its field ``adjoint``; any other `Adjoint` that supports the pencil may replace
+    it.
 
     Attributes:
-        tolerance: the error in the energy norm, relative to the largest row. Rounding of eigenvectors is a lower bound.
+        tolerance: the error in the energy norm, relative to the largest row. Rounding errors of eigenvectors bound it
+            from below.
     """
 
     tolerance: eqx.AbstractVar[float]
@@ -62,7 +64,7 @@ class Adjoint(eqx.Module, Generic[P]):
         require_number("tolerance", self.tolerance, 1)
 
     def prepare(self, pencil: P, values: Values, k: int) -> Any:
-        """Return the data that `solve` needs for the first k of p eigenvalues, independent of right-hand sides."""
+        """Return the data that `solve` needs for the first k of p eigenvalues and any right-hand sides."""
         return None
 
     @abstractmethod
@@ -81,7 +83,7 @@ def attainable(tolerance: float, dtype: Any) -> float:
 def definite_product(
     stiffness: Callable[[Array], Array], mass: Callable[[Array], Array], shifts: Float[Array, " b"], beyond: Scalar
 ) -> Callable[[Columns], tuple[Columns, Float[Array, " b"]]]:
-    """Return x ↦ (K − λᵢM) xᵢ, and the energy below which K − λᵢM counts as singular on the complement."""
+    """Return a function that maps xᵢ to (K − λᵢM) xᵢ and to the energy below which K − λᵢM counts as singular."""
 
     def product(x: Columns) -> tuple[Columns, Float[Array, " b"]]:
         image = mass(x)
@@ -104,11 +106,11 @@ def amplification(values: Values, k: int) -> OfRows:
 # The tolerance is relative to the right-hand sides bᵢ before the projection Q = I − MΦΦᵀ. The projections Qbᵢ may be
 # pure rounding errors. For example, if the tensors T change by a multiple of T, dK and dM are multiples of K and M, so
 # that bᵢ is a multiple of Mφᵢ and Qbᵢ = 0. Such noise lies mostly in the span of MΦ, so that a solution with a small
-# error relative to the noise does not exist. Therefore the row counts as zero. The same holds in reverse mode, where
+# error relative to the noise does not exist. Therefore such a row counts as zero. The same holds in reverse mode, where
 # the bᵢ are cotangents of the solutions. For example, if all nodes have equal weights, the bᵢ are multiples of Mφᵢ.
 #
-# Small rows need fewer digits, or none, because they contribute little to sums over all rows. Rows with λᵢ near Λ have
-# a larger weight, because the inverse amplifies them.
+# Small rows need fewer correct digits, or none, because they contribute little to sums over all rows. Rows with λᵢ near
+# Λ have a larger weight, because the inverse amplifies them.
 def wanted_errors(before: OfRows, after: OfRows, amplified: OfRows, tolerance: float, dtype: Any) -> OfRows:
     """Return the wanted errors in the energy norm, relative to each row's own norm; infinite for rows that are zero.
 
@@ -120,7 +122,7 @@ def wanted_errors(before: OfRows, after: OfRows, amplified: OfRows, tolerance: f
         dtype: the dtype to which eigenvectors and rows were rounded.
     """
     xp, largest = amplified.__array_namespace__(), before.max()
-    # If all rows are zero, no row is solved.
+    # If all rows are zero, each row counts as zero.
     share = after / xp.where(largest > 0, largest, 1) * amplified
     noise = (after <= attainable(0, dtype) * before) | (share <= tolerance)
     return xp.where(noise, xp.inf, xp.minimum(tolerance / xp.where(noise, 1, share), 0.1))
@@ -137,8 +139,8 @@ def group_numbers(
 ) -> Int[np.ndarray, " m"]:
     """Divide distances from Λ into groups in geometric progression, and return the group of each distance.
 
-    If the largest and least distances have the ratio ρ, s groups have the condition ρ^(1/2s). The number s minimises
-    the cost of factorisations and of steps for all rows.
+    If the largest distance is ρ times the least, each of s groups has a preconditioned matrix of condition ρ^(1/2s).
+    The number s minimises the cost of factorisations and of steps for all rows.
     """
     ratio = max(distance.max() / distance.min(), 1 + 1e-12)
 
@@ -151,7 +153,7 @@ def group_numbers(
 
 
 def shifts_between(values: Values, nearest: Shifts, farthest: Shifts) -> Shifts:
-    """Return each group's shift of least condition, whose distance from Λ is a geometric mean."""
+    """Return each group's shift, whose distance from Λ is the geometric mean of the group's extreme distances."""
     xp = values.__array_namespace__()
     targets, below = first_beyond(values) - xp.sqrt(nearest * farthest), -0.1 * values[-1]
     if values.size == 1:
@@ -184,8 +186,8 @@ def without_known(pencil: SymmetricPencil, vectors: Vectors) -> OfColumns:
     return lambda x: x - matmul(products_with_columns(vectors, mass(x)).T, vectors).T
 
 
-# Arrays as large as the eigenvectors are updated in place. Filling a new array of this size takes as long as products
-# with it, because the system must provide its memory.
+# Arrays as large as the eigenvectors are updated in place. To fill a new array of this size takes as long as products
+# with it, because the system must provide the memory.
 def projected(
     pencil: SymmetricPencil, vectors: Vectors, rhs: Rows, tolerance: float, amplified: OfRows
 ) -> tuple[Rows, OfRows]:
@@ -211,7 +213,7 @@ def cleaned(pencil: SymmetricPencil, vectors: Vectors, x: Rows) -> Rows:
 
 
 def _in_parts(project: Callable[..., tuple[Array, ...]], *rows: Array) -> tuple[Array, ...]:
-    """Project blocks of rows, one after another. The last block may overlap; projecting twice changes nothing."""
+    """Project blocks of rows, one after another. The last block may overlap another, which is harmless."""
     size = even_size(len(rows[0]), _ROWS)
     starts, _ = row_blocks(len(rows[0]), size)
 

@@ -32,7 +32,7 @@ BLOCK = 16
 WINDOW = 32
 """The number of eigenvectors nearest to a shift that every step projects out."""
 _GROWTH = 4e7
-"""A bound of the growth of rounding errors along computed eigenvectors; measured values are usually 1e4 to 1e5."""
+"""The largest factor by which solves amplify rounding errors along computed eigenvectors; 1e4 to 1e5 is usual."""
 _MEMORY = 5e8
 """The maximal total size of the factorisations in bytes."""
 
@@ -66,7 +66,7 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         """Factorise K − σM for each group of the first k of p eigenvalues."""
         dissection = dissect(pencil.pattern)
         if is_concrete_on_cpu((pencil, values)):
-            # Factorise the shifts in sequence by the function that the eigensolver has already compiled.
+            # Factorise at one shift after another by the function that the eigensolver has already compiled.
             dissection = jax.device_put(dissection)
             shifts = self._shifts(pencil, np.asarray(values), self.groups(dissection, len(values), k, values.dtype))
             each = [factorise(dissection, pencil.shifted(jnp.asarray(shift))) for shift in shifts]
@@ -121,7 +121,7 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
     # `InteriorAdjoint` overrides the following methods.
 
     def _distance(self, p: int, k: int, row: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-        """Return the distances of the rows' eigenvalues from Λ, by Weyl's law in 2D."""
+        """Return the distances of the rows' eigenvalues from Λ, up to a factor, by Weyl's law in 2D."""
         return p + 1 - row
 
     def _shifts(self, pencil: Any, values: Values, groups: Groups) -> Shifts:
@@ -132,7 +132,8 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         return complement.amplification(values, k)
 
     # If r has a component along φⱼ by rounding, (K − λᵢM)(K − σM)⁻¹ multiplies it by (λⱼ − λᵢ)/(λⱼ − σ). This factor is
-    # large mainly for λⱼ near σ. So each step projects out only these φⱼ; the others follow at the end or a restart.
+    # large mainly for λⱼ near σ. So each step projects out only these φⱼ; the other φⱼ are projected out at the end or
+    # at a restart.
     def _solve_block(
         self, pencil: Any, values: Values, without_near: OfColumns, without_known: OfColumns, *of_block: Any
     ) -> Columns:
@@ -154,7 +155,7 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
 #
 # has the eigenvalues (λⱼ − λᵢ)/(λⱼ − σ) > 0 on the complement. A is symmetric in the inner product xᵀMy. So conjugate
 # gradients in this inner product solve A xᵢ = (K − σM)⁻¹ bᵢ. Products with A use the exact K − λᵢM. So an inaccurate
-# factorisation slows convergence, but does not change the solution.
+# factorisation slows down convergence, but does not change the solution.
 #
 # Define the odds ω(λ) = (Λ₊ − λ)/(λ − Λ₋). The condition of A is at most the ratio of ω(λᵢ) and ω(σ); for example, if
 # λᵢ < σ, the eigenvalues of A lie between (λᵢ − Λ₋)/(σ − Λ₋) and (Λ₊ − λᵢ)/(Λ₊ − σ). The odds replace the distance from
@@ -169,7 +170,7 @@ class InteriorAdjoint(FactorisedAdjoint):
     """
 
     def _distance(self, p: int, k: int, row: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-        """Return the odds for equidistant eigenvalues with equally many guards on both sides."""
+        """Return the odds of the rows, as if eigenvalues were equidistant with equally many guards on both sides."""
         others = (p - k) / 2
         return (k + others - row) / (row + others + 1)
 
@@ -196,7 +197,7 @@ class InteriorAdjoint(FactorisedAdjoint):
         def product(x: Columns) -> tuple[Columns, Float[Array, " b"]]:
             return factor.solve(stiffness(x) - shifts * mass(x)), complement.SINGULAR * inner(x, x)
 
-        # Rounding leaves components along computed eigenvectors. A amplifies only the components near σ.
+        # Rounding leaves components along computed eigenvectors. A amplifies only those whose eigenvalue is near σ.
         right = factor.solve(b)
         return conjugate_gradients(product, without_near, right, wanted, inner, without_known).converged
 

@@ -33,22 +33,22 @@ _FIRST_ROUNDS, _COARSE_ROUNDS = 4, 2
 _ROOM = 12
 """The least number of degrees of freedom per vector on a coarse grid."""
 _SPARE = 0.35
-"""The number of additional vectors as a fraction of k. More vectors need fewer but dearer rounds."""
+"""The number of additional vectors as a fraction of k. With more vectors, the rounds are fewer but more expensive."""
 _LEAST_NODES = 6
 """The least number of nodes along each axis at which a grid is coarsened."""
 _LARGE = 1 << 21
-"""The total size of the vectors above which a round is so long that progress is reported after each block."""
+"""The total number of entries of the vectors above which progress is reported after each block, not only each round."""
 
 Pairs = tuple[Float[Array, " k"], Float[Array, "k n_dof"]]
 
 
 class ChebyshevFilter(Eigensolver[Pencil]):
-    """Chebyshev-filtered subspace iteration on stencils, without a factorisation; memory is mainly for the vectors.
+    """Chebyshev-filtered subspace iteration on stencils, without a factorisation; the vectors take most of the memory.
 
     The solver is for grids, mainly in 3D, where factorisations have much fill-in, and for accelerators. Filters run in
     single precision without loss of accuracy, because they act on residuals that are computed in the precision of the
     matrices. All pairs are computed simultaneously, so that multiple eigenvalues are complete; but no certificate shows
-    that none was missed. All works under `jit`. Outside `jit`, the solver can be interrupted and reports progress
+    that none was missed. The solver works under `jit`. Outside `jit`, it can be interrupted and reports progress
     between two rounds.
 
     Attributes:
@@ -128,23 +128,27 @@ _compiled = jax.jit(_lowest, static_argnames=("plan", "max_rounds", "report"))
 
 def _converge(grid: GridFilter, rounding: Array, state: FilterState, max_rounds: int, report: Report) -> FilterState:
     """Return the state after the rounds on the finest grid. Report each round and, for large problems, each block."""
+    wanted = grid.plan.wanted
+
+    def excess(state: FilterState) -> Float[Array, " wanted"]:
+        return grid.excess(rounding, state)[:wanted]
 
     def going_on(state: FilterState) -> Bool[Array, ""]:
-        return (grid.unconverged(rounding, state) > 0) & (state.rounds < max_rounds)
+        return jnp.any(~(excess(state) <= 1)) & (state.rounds < max_rounds)
 
     if report is silent or is_traced(state):
         return while_loop(going_on, partial(grid.improve, rounding), state)
-    wanted, pace = grid.plan.wanted, Pace(float(grid.excess(rounding, state)))
+    pace = Pace(float(jnp.max(excess(state))))
     in_steps = grid.plan.mesh is None and state.vectors.size >= _LARGE
     while going_on(state):
-        text = f"{wanted - int(grid.unconverged(rounding, state))} of {wanted} pairs, round {int(state.rounds) + 1}"
+        text = f"{int(jnp.sum(excess(state) <= 1))} of {wanted} pairs, round {int(state.rounds) + 1}"
         report(Status(text, pace.seconds_left()))
 
         def tell(done: int, of: int, text: str = text) -> None:
-            report(Status(f"{text}, {done / of:.0%} of it filtered", pace.seconds_left(done, of)))
+            report(Status(f"{text}: {done / of:.0%} of the products", pace.seconds_left(done, of)))
 
         state = grid.improve_told(rounding, state, tell) if in_steps else grid.improve(rounding, state)
-        pace.round_done(float(grid.excess(rounding, state)))
+        pace.round_done(float(jnp.max(excess(state))))
     return state
 
 
@@ -173,7 +177,8 @@ class Pace:
         if not self._factor > 1 or not self._excess > 1:
             return None
         rounds = math.ceil(math.log(self._excess) / math.log(self._factor))
-        # Later rounds filter fewer pairs. So the work of this round, if known, is a better estimate than the last.
+        # Later rounds filter fewer pairs. So if the work of this round is known, it is a better estimate than the work
+        # of the last round.
         return (rounds - done / self._work) * self._seconds * self._work / self._last_work
 
 

@@ -29,8 +29,8 @@ def coarsen(fine: NodalPencil) -> NodalPencil:
     axes = [axis_colours(n, 3, wraps) for n, wraps in zip(shape, fine.periodic, strict=True)]
     counts = [int(axis.max()) + 1 for axis in axes]
     padded = -(-math.prod(counts) // _COLUMNS) * _COLUMNS
-    # Neighbours have different colours; the colour of a neighbour that does not exist is −1. The only constants of the
-    # program are arrays along axes. The barrier prevents constant folding.
+    # Neighbours have different colours; the colour of a neighbour that does not exist is −1. Only arrays along single
+    # axes are constants of the program, and the barriers keep XLA from folding constants.
     colours = jnp.zeros((), jnp.float32)
     along = jax.lax.optimization_barrier([jnp.asarray(axis, jnp.float32) for axis in axes])
     for axis, (own, count) in enumerate(zip(along, counts, strict=True)):
@@ -45,8 +45,8 @@ def coarsen(fine: NodalPencil) -> NodalPencil:
         return tuple(to_rows(*restrict(image)) for image in fine.products()(raised))
 
     def coupled(images: Float[Array, "blocks b coarse"]) -> Stencil:
-        # Basis functions of one colour have disjoint neighbourhoods. So the image of the sum of these functions at a
-        # node is the entry that couples the node to the nearest function.
+        # Basis functions of one colour have disjoint neighbourhoods. So at each node, the image of their sum is the
+        # entry that couples the node to the only near function.
         entries = jnp.take_along_axis(images.reshape(padded, *shape), jnp.maximum(of_neighbour, 0), axis=0)
         return Stencil(jnp.where(of_neighbour >= 0, entries, 0), fine.periodic)
 
@@ -55,7 +55,8 @@ def coarsen(fine: NodalPencil) -> NodalPencil:
 
 
 def interpolate(fine: NodalPencil, x: Float[Array, "*coarse b"]) -> Float[Array, "*shape b"]:
-    """Interpolate multilinearly from every second node, constantly beyond the rim; zero at nodes not free."""
+    """Interpolate multilinearly from every second node, and constantly beyond the last; set other than free nodes to
+    0."""
     every_second = (slice(None, None, 2),) * len(fine.shape)
     weights = _interpolate(fine.domain[every_second][..., None].astype(x.dtype), fine.shape, fine.periodic)
     x = _interpolate(jnp.where(fine.free[every_second][..., None], x, 0), fine.shape, fine.periodic)

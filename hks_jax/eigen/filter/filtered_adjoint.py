@@ -51,7 +51,7 @@ class FilteredAdjoint(Adjoint[Pencil]):
         require_count("block", self.block)
 
     def prepare(self, pencil: Pencil, values: Values, k: int) -> Scalar:
-        """Return an upper bound of the spectrum of D⁻¹K."""
+        """Return an upper bound of the spectrum of D⁻¹K, where D is the lumped mass."""
         if not isinstance(pencil.stiffness, StencilOperator):
             raise ValueError("adjoint: got FilteredAdjoint, which needs a grid; use FactorisedAdjoint for a mesh")
         return upper_end(nodal_pencil(pencil))
@@ -61,11 +61,12 @@ class FilteredAdjoint(Adjoint[Pencil]):
         """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`."""
         space, nodal, high = pencil.space, nodal_pencil(pencil), prepared
         tolerance, beyond = complement.attainable(self.tolerance, rhs.dtype), complement.first_beyond(values)
-        # The polynomial acts on D⁻¹K, whose values for φ are φᵀKφ / φᵀDφ. On coarse grids these are a fraction of λ.
+        # The polynomial acts on D⁻¹K, whose Rayleigh quotient for φ is φᵀKφ / φᵀDφ: on coarse grids, a fraction of λ.
         mass = space.restrict(nodal.lumped)
         quotients = values / jax.lax.map(lambda phi: jnp.sum(mass * phi * phi), vectors, batch_size=self.block)
         band = Band(jnp.minimum(jnp.max(quotients) * (1 + 1 / values.size), _WIDEST * high), high)
-        # At values nearer to the band, the polynomial would not reach its gain, and not be definite.
+        # At values nearer to the band, the polynomial would not reach its gain, and the preconditioner might not be
+        # definite.
         nearest = (math.cosh(math.acosh(_GAIN) / _MOST_DEGREE) - 1) / 2
         quotients = jnp.minimum(quotients, band.low - nearest * (band.high - band.low))
         clean = complement.without_known(pencil, vectors)

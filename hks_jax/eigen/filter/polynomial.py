@@ -25,13 +25,13 @@ class Band(NamedTuple):
     high: Float[Array, ""]
 
     def degree_for(self, value: Float[Array, "*b"], gain: float) -> Float[Array, "*b"]:
-        """Return the degree at which the polynomial equals ``gain`` at a value below the band: gain = cosh(degree · a).
+        """Return the degree at which the polynomial equals ``gain`` at a value below the band.
 
         The degree is at most `MOST_DEGREE`. If a wide band needs a higher degree, pairs do not converge.
         """
         below = jnp.maximum(self.low - value, 0)
         degree = jnp.arccosh(jnp.asarray(gain, value.dtype)) / jnp.arccosh(1 + 2 * below / (self.high - self.low))
-        return jnp.fmin(degree, MOST_DEGREE)  # also if the degree is NaN, because the band is empty
+        return jnp.fmin(degree, MOST_DEGREE)  # the degree is NaN if the band is empty
 
 
 # Let x be an approximate eigenvector with Rayleigh quotient λ and residual r = Kx − λMx. Let p be the Chebyshev
@@ -63,7 +63,7 @@ def correction(
     whole: Columns | float = 0.0,
     terms: Int[Array, ""] | int = 0,
 ) -> Columns:
-    """Return q(D⁻¹K) D⁻¹ residual, where q belongs to ζ = ``value``, which is at most the band's low end.
+    """Return q(D⁻¹K) D⁻¹r for the residual r and the polynomial q of ζ = ``value``, at most the band's low end.
 
     If n = ``terms`` > 0, W replaces D⁻¹, and value and band refer to WK. If a column x of ``whole`` is not zero, the
     residual's column must be Kx; then D⁻¹Kx − ζx replaces D⁻¹r, which amounts to p(D⁻¹K)/p(ζ) applied to x.
@@ -85,14 +85,14 @@ def correction(
         w = inverse(residual / pencil.lumped[..., None].astype(dtype)) - aligned(reference.astype(dtype), whole) * whole
         return chebyshev_iteration(lambda z: inverse(stiffness(z)), w, band.low, band.high, reference, degree)
 
-    # The cases are separate, so that XLA fuses a whole step if there are no further terms.
+    # The two cases are separate, so that XLA fuses a whole step if there are no further terms.
     return jax.lax.cond(jnp.asarray(terms) > 0, lambda: run(further), lambda: run(lambda y: y))
 
 
 @jax.jit
 def upper_end(pencil: NodalPencil) -> Float[Array, ""]:
-    """Return an upper bound of the spectrum of D⁻¹K."""
+    """Return an upper bound of the spectrum of D⁻¹K, where D is the lumped mass."""
     lumped, sums = pencil.lumped[..., None], pencil.lumped_or_zero[..., None]
     bound = lanczos_bound(pencil.stiffness.of_columns(), lambda r: r / lumped, sums, sums.size, _STEPS)
-    # The Gershgorin bound never fails, but is up to twice too large if tensors vary.
+    # Gershgorin's bound always holds, but may be twice too large if tensors vary.
     return jnp.minimum(bound, gershgorin(pencil.stiffness.coefficients, 1 / pencil.lumped))

@@ -22,15 +22,15 @@ from hks_jax.linear.accelerators import row_by_row
 from hks_jax.linear.loops import for_each
 
 _GAIN = 40.0
-"""The factor by which one round damps unwanted modes. At larger factors the lumped mass would limit the filter."""
+"""The factor by which one round damps unwanted modes. With more, the error by the lumped mass dominates."""
 _SPREAD = 1e5
 """The largest growth of the lowest mode relative to the edge of the band. Beyond it, rounding errors dominate."""
 _LEAST_DEGREE = 4
 _MARGIN = 1.1
 """The safety factor of Weyl's law for the eigenvalue of the last vector."""
 _SPLIT, _APART = 0.02, 1.5
-"""The limits beyond which the lumped mass gets further terms: the spread of the relative shifts of similar eigenvalues,
-and the least ψ, relative to the last wanted eigenvalue, of modes above twice that eigenvalue."""
+"""The limits beyond which the inverse mass gets further terms: on the spread of the relative shifts of similar
+eigenvalues, and on the least ψ of modes above twice the last wanted eigenvalue, relative to that eigenvalue."""
 _MOST_TERMS = 15
 """The maximal number of further terms of the Neumann series of the inverse mass."""
 
@@ -69,15 +69,15 @@ class Filtering(NamedTuple):
     band: Band  # the damped interval
     terms: Number  # the number of further terms in the inverse mass
     degrees: Int[Array, " blocks"]  # the degree for each block; 0 if all its vectors have converged
-    values: Values  # ψ of each vector; its polynomial is scaled to 1 there
-    factor: Values  # the factor of each vector's correction
+    values: Values  # ψ of each vector, at which its polynomial is scaled to 1
+    factor: Values  # the factor by which each vector's correction is scaled
 
 
 class GridFilter(eqx.Module):
     """Subspace iteration on one grid. All grids of one shape share the compiled functions."""
 
     pencil: NodalPencil  # K and M
-    high: Scalar  # an upper bound of the spectrum of D⁻¹K
+    high: Scalar  # an upper bound of the spectrum of D⁻¹K, where D is the lumped mass
     plan: Plan = eqx.field(static=True)
 
     @property
@@ -85,19 +85,11 @@ class GridFilter(eqx.Module):
         """The slabs into which the grid is divided between rounds; None on one device."""
         return self.pencil.cut(self.plan.mesh)
 
-    def allowed(self, rounding: Scalar, state: FilterState) -> Values:
-        """Return the largest residuals at which pairs count as converged."""
-        scale = jnp.maximum(state.values, state.values[self.plan.n_null])
-        return allowed_residuals(scale, rounding, self.plan.tolerance)
-
-    def unconverged(self, rounding: Scalar, state: FilterState) -> Number:
-        """Return the number of wanted pairs that have not converged."""
-        return jnp.sum(~(state.residuals <= self.allowed(rounding, state))[: self.plan.wanted])
-
     @jax.jit
-    def excess(self, rounding: Scalar, state: FilterState) -> Scalar:
-        """Return the largest ratio of a wanted pair's residual to its allowed residual."""
-        return jnp.max((state.residuals / self.allowed(rounding, state))[: self.plan.wanted])
+    def excess(self, rounding: Scalar, state: FilterState) -> Values:
+        """Return the residuals as multiples of the largest residuals that count as converged."""
+        scale = jnp.maximum(state.values, state.values[self.plan.n_null])
+        return state.residuals / allowed_residuals(scale, rounding, self.plan.tolerance)
 
     @jax.jit
     def from_random(self, volume: Scalar) -> FilterState:
@@ -139,10 +131,10 @@ class GridFilter(eqx.Module):
     def improve_told(
         self, rounding: Scalar | None, state: FilterState, done: Callable[[int, int], Any] | None = None
     ) -> FilterState:
-        """Filter the blocks that have not converged (all, if ``rounding`` is None), then apply Rayleigh–Ritz.
+        """Filter the blocks that have not converged (all blocks if ``rounding`` is None), then apply Rayleigh–Ritz.
 
-        Outside `jit` and on one device, the round can be interrupted between two blocks. After each block, ``done`` is
-        called with the numbers of finished and of all products. `improve` is the compiled version.
+        Outside `jit` and on one device, the round can be interrupted between two blocks. After each block, ``done``
+        receives the number of products so far and the number of all products. `improve` is the compiled version.
         """
         slabs, plan, layout = self.slabs, self.plan, _layout(self.slabs)
 
@@ -175,7 +167,7 @@ class GridFilter(eqx.Module):
         edge = _MARGIN * filtered_values[plan.wanted - 1] * (plan.size / plan.wanted) ** (2 / len(self.pencil.shape))
         low = jnp.minimum(jnp.minimum(jnp.max(filtered_values), edge), high / 2)
         band = Band(low, high)
-        left = spare | (True if rounding is None else ~(state.residuals <= self.allowed(rounding, state)))
+        left = spare | (True if rounding is None else ~(self.excess(rounding, state) <= 1))
         # The spare vectors need no higher degree than the last wanted vector.
         goal = jnp.where(spare, filtered_values[plan.wanted - 1], filtered_values)
         most = band.degree_for(jnp.zeros_like(low), _SPREAD)
@@ -185,7 +177,7 @@ class GridFilter(eqx.Module):
 
     @partial(jax.jit, donate_argnames="vectors")
     def filter_block(self, chosen: Filtering, values: Values, number: Number, own: Number, vectors: OwnRows) -> OwnRows:
-        """Filter one block of rows; `number` is its index among all blocks, and `own` its index among these rows."""
+        """Filter one block of rows: block `number` of all blocks, which is block `own` of this device."""
         pencil, block, products = self.pencil, self.plan.block, self.pencil.products()
         band, degree = chosen.band, chosen.degrees[number]
 
@@ -203,7 +195,7 @@ class GridFilter(eqx.Module):
             z = jnp.where(inside, 1, jnp.clip(scale, 0, 1)) * z.astype(x.dtype)
             return rows + row_by_row(to_rows(z))
 
-        # The condition gets only the block, because XLA copies the operands of a condition.
+        # `cond` gets only the block, because XLA copies the operands of a condition.
         rows = row_by_row(jax.lax.dynamic_slice_in_dim(vectors, own * block, block))
         rows = jax.lax.cond(degree > 0, filtered, lambda unchanged: unchanged, rows)
         return jax.lax.dynamic_update_slice_in_dim(vectors, rows, own * block, axis=0)
@@ -239,6 +231,6 @@ def _lumping(plan: Plan, state: FilterState) -> tuple[Number, Values, Values]:
 
 
 def _layout(slabs: Slabs | None) -> FilterState:
-    """Return the sharding of a state: vectors are in slabs, all else is on every device."""
+    """Return the sharding of a state: vectors are divided into slabs; every device has the other arrays."""
     vectors = EVERYWHERE if slabs is None else PartitionSpec(None, slabs.name)
     return FilterState(EVERYWHERE, vectors, EVERYWHERE, EVERYWHERE, EVERYWHERE, EVERYWHERE)  # type: ignore[arg-type]

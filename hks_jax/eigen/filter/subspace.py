@@ -33,7 +33,7 @@ Rows = Float[Array, "m nodes"]
 
 
 def shared(slabs: Slabs | None, function: Callable, in_specs: Any, out_specs: Any) -> Callable:
-    """Return the function that every device applies to its share."""
+    """Return the function, applied by every device to its share."""
     if slabs is None:
         return function
     # `check_vma` cannot verify loops of different lengths, nor that results agree on all devices.
@@ -79,7 +79,7 @@ def rayleigh_ritz(pencil: NodalPencil, slabs: Slabs | None, block: int, x: Rows)
 
     def among_rows(number: Array) -> tuple[Array, ...]:
         images = products(block_of(x, number, block, pencil.shape))
-        # Images stay columns. If images became rows, XLA would compute stencils in that layout, seven times slower.
+        # Images stay columns, because for rows XLA would compute stencils in that layout, seven times slower.
         return tuple(matmul(x, image.reshape(nodes, block)) for image in images)
 
     both = jax.lax.map(among_rows, jnp.arange(m // block))

@@ -20,7 +20,7 @@ def factorise_on_host(matrix: csc_matrix) -> SuperLU:
 
 
 def inertia_on_host(K: csc_matrix, M: csc_matrix, shift: float) -> tuple[int, bool]:
-    """Return the number of eigenvalues below σ, by the inertia of K − σM, and whether `try_out`'s test confirms it."""
+    """Return the number of eigenvalues below σ, by the inertia of K − σM, and whether a test confirms it."""
     matrix = (K - shift * M).tocsc()
     try:
         factor = factorise_on_host(matrix)
@@ -31,13 +31,13 @@ def inertia_on_host(K: csc_matrix, M: csc_matrix, shift: float) -> tuple[int, bo
     for _ in range(2):
         before, residual = residual, residual - matrix @ factor.solve(residual)
         rates.append(np.linalg.norm(residual) / max(np.linalg.norm(before), np.finfo(float).tiny))
-    # If SuperLU exchanged rows, the pivots would not show the inertia.
+    # If SuperLU exchanges rows, the pivots' signs are not the inertia.
     sound = bool(max(rates) < CONTRACTION and (factor.perm_r == factor.perm_c).all())
     return int((factor.U.diagonal() < 0).sum()), sound
 
 
 def host_matrices(pencil: SymmetricPencil) -> tuple[tuple[Array, ...], Callable[..., tuple[csc_matrix, csc_matrix]]]:
-    """Return the entries of K and M with the null vectors, and a function that makes SciPy matrices of them.
+    """Return the entries of K, of M and of null vectors, and a function that makes SciPy matrices from these arrays.
 
     The matrices are float64. For a null vector v, rounding errors in Kv would act as a potential. These errors are
     subtracted from the diagonal if each node belongs to exactly one null vector.

@@ -1,4 +1,4 @@
-"""Large sparse pencils by SciPy's shift-invert Lanczos on the host."""
+"""Eigenpairs of large sparse pencils by SciPy's shift-invert Lanczos, on the host."""
 
 import time
 from typing import ClassVar
@@ -64,18 +64,19 @@ class ShiftInvert(Eigensolver[Pencil]):
             require_count("basis", self.basis, 2)
 
     def lowest(self, pencil: Pencil, k: int, report: Report = silent) -> RawPairs:
-        """Return the k lowest eigenpairs, and the shift at which inertia confirmed them."""
+        """Return the k lowest eigenpairs, and the shift at which inertia confirmed that none is missing."""
         n, dtype, dimension = pencil.space.n_dof, pencil.stiffness.dtype, pencil.space.dimension
         data, matrices = host_matrices(pencil)
 
         def solve(volume: ArrayLike, *data: ArrayLike) -> tuple[np.ndarray, ...]:
             K, M = matrices(*data)
-            # A shift that is small relative to Weyl's λ₁, or to a mean eigenvalue, keeps K + sM positive definite.
+            # Any s > 0 makes K + sM positive definite; here s is small relative to Weyl's λ₁ or to a typical
+            # eigenvalue.
             if dimension is None or not np.isfinite(volume):
                 shift = 1e-3 * float(np.median(K.diagonal() / M.diagonal()))
             else:
                 shift = 0.1 * (2 * np.pi) ** 2 / float(np.asarray(volume)) ** (2 / dimension)
-            # ARPACK's products with the basis gain little from threads, and would wait for them on busy cores.
+            # Threads make ARPACK's products with the basis hardly faster, and slower if the cores are busy.
             with threadpool_limits(1, user_api="blas"):
                 return tuple(np.asarray(result, dtype) for result in self._lanczos(K, M, k, shift, report))
 
@@ -106,7 +107,7 @@ class ShiftInvert(Eigensolver[Pencil]):
                 of_each = (time.perf_counter() - factorised) / solves
                 # The final count of eigenvalues takes another factorisation.
                 left = to_come * of_each + factorised - begun
-                report(Status(f"{solves} solves of about {solves + to_come}", left))
+                report(Status(f"{solves} of about {solves + to_come} solves", left))
             y = factor.solve(x)
             return y - vectors @ (vectors.T @ (M @ y))
 
@@ -141,10 +142,10 @@ class ShiftInvert(Eigensolver[Pencil]):
 
 
 # At a restart, ARPACK keeps the converged vectors and half of the remaining basis; each restart takes a few additional
-# solves. With k from 10 to 200 it restarted once in the plane, and three or four times on cubes with multiple
-# eigenvalues, where the first estimate is too short by a factor of 1.7.
+# solves. For k from 10 to 200, it restarted once on planar domains, and three or four times on cubes with multiple
+# eigenvalues, where the first estimate is too small by a factor of 1.7.
 def expected_solves(done: int, basis: int, wanted: int) -> int:
-    """Return the expected total number of solves, assuming that the current restart (or the first) is the last."""
+    """Return the expected total number of solves, if the current restart (or the first one) is the last."""
     restart = (basis - wanted) // 2 + 4
     return basis + max(1, -(-(done - basis) // restart)) * restart
 
@@ -160,7 +161,7 @@ def _padded(values: np.ndarray, vectors: np.ndarray, k: int, complete_below: flo
 
 
 def lower_bound(pencil: Pencil) -> Float[Array, ""]:
-    """Return a lower bound of the spectrum, which inertia confirms; NaN if the search fails."""
+    """Return a lower bound of the spectrum, confirmed by inertia; NaN if the search fails."""
     data, matrices = host_matrices(pencil)
     K, M = matrices(*data)
     typical = float(np.median(np.abs(K.diagonal()) / M.diagonal())) or 1.0

@@ -32,8 +32,8 @@ _DENSE = 3000
 class BlockLanczos(Eigensolver[SymmetricPencil]):
     """Spectrum slicing: shift-invert block Lanczos with nested-dissection factorisations, all in JAX.
 
-    The solver is for grids and meshes, mainly in 2D (in 3D, factors have much fill-in). The same code runs on CPUs and
-    accelerators, and works under `jit`. Outside `jit`, the solver can be interrupted, reports progress between two
+    The solver is for grids and meshes, mainly in 2D; in 3D, the factors have much fill-in. The same code runs on CPUs
+    and accelerators, and works under `jit`. Outside `jit`, the solver can be interrupted, reports progress between two
     slices, and finds eigenvalues of any multiplicity, if necessary (up to 3000 unknowns) by the dense solver.
 
     Attributes:
@@ -68,9 +68,9 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
         def step(both: tuple[SlicingState, Stored]) -> tuple[SlicingState, Stored]:
             factor, searchable, both = cut(problem, dissection, plan, *both)
             both = when(searchable, partial(search, problem, factor, plan), both)
-            if report is not silent and not is_traced(both):  # a report makes the host wait for its numbers
+            if report is not silent and not is_traced(both):  # for a report, the host must wait for the numbers
                 known, bound = min(int(both[0].known), k), float(both[0].complete_below)
-                report(f"{known} of {k} eigenpairs, all below {bound:.6g}")
+                report(f"{known} of {k} eigenpairs, and all eigenvalues below {bound:.6g}")
             return both
 
         state, stored = while_loop(lambda both: unfinished(plan, both[0]), step, first_state(problem, plan))
@@ -95,13 +95,13 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
 
 
 def known_by_weyl(pencil: SymmetricPencil) -> bool:
-    """Return whether Weyl's law predicts the beginning and density of the spectrum; otherwise inertia is used."""
+    """Return whether Weyl's law predicts where the spectrum begins and its density; otherwise inertia is needed."""
     return isinstance(pencil, Pencil) and pencil.measured and pencil.null_space is not None
 
 
 @jit_quickly(static_argnames="plan")
 def expected(pencil: SymmetricPencil, plan: Plan) -> Problem:
-    """Return the pencil with estimates of its spectrum, by Weyl's law on a domain or else by previous counts."""
+    """Return the pencil with estimates of its spectrum, from the counts of a `LocatedPencil` or from Weyl's law."""
     if isinstance(pencil, LocatedPencil):
         spacing = pencil.spacing
         return Problem(pencil, pencil.first, spacing, spacing, spacing, pencil.negative)
@@ -128,7 +128,7 @@ def _lowest(
 
 
 def first_from_origin(solver: Eigensolver, k: int, guards: int, report: Report, pencil: LocatedPencil) -> RawPairs:
-    """Return the first k pairs above the origin, then guard pairs: the following ones, and those below the origin.
+    """Return the first k pairs above the origin, then guard pairs: the next pairs above, and pairs below the origin.
 
     If the spectrum has too few guards, the remaining guards are zero vectors with the eigenvalue of the first pair.
     """
@@ -147,7 +147,7 @@ def first_from_origin(solver: Eigensolver, k: int, guards: int, report: Report, 
 
 @jax.jit
 def _from(first: Number, existing: Number | int, values: Values, vectors: Vectors) -> tuple[Values, Vectors]:
-    """Rotate the pairs so that the first wanted pair comes first. Pairs that do not exist become zero vectors."""
+    """Rotate the order of the pairs until pair ``first`` comes first; pairs that do not exist become zero vectors."""
     there = jnp.arange(values.size) < existing
     values, vectors = jnp.where(there, values, values[first]), jnp.where(there[:, None], vectors, 0)
     return jnp.roll(values, -first), jnp.roll(vectors, -first, axis=0)

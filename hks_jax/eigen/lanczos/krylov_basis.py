@@ -1,4 +1,4 @@
-"""A growing M-orthonormal Krylov basis, and operations on its blocks, by XLA's operations or by kernels."""
+"""A growing M-orthonormal Krylov basis, and operations on its blocks, by XLA's operations or by CUDA kernels."""
 
 from collections.abc import Callable
 from itertools import accumulate
@@ -18,7 +18,7 @@ _PIECE = 128
 _SMALL = 1e-7
 """The largest components that may be projected out in single precision; the remainder is then at rounding level."""
 _NODES = 2048
-"""The number of degrees of freedom combined together: operands and results fit into the cache."""
+"""The number of degrees of freedom per step of `combined`: operands and results fit into the cache."""
 
 
 class Piece(NamedTuple):
@@ -38,7 +38,7 @@ def begin(known: Float[Array, "w n_dof"], size: int, block: int) -> Basis:
 
     The number of known vectors and the size are multiples of ``block``, the number of rows written at once. On
     accelerators, the basis is a single array, because skipping empty pieces would take longer than computing with them.
-    There, basis vectors are columns, as in blocks, so that no kernel has to transpose.
+    On accelerators, basis vectors are columns, as in blocks, so that no kernel has to transpose.
     """
     if accelerators.at_hand():
         return jnp.pad(known.T, ((0, 0), (0, size - len(known))))
@@ -52,7 +52,7 @@ def begin(known: Float[Array, "w n_dof"], size: int, block: int) -> Basis:
 
 
 def write(basis: Basis, block: Block, row: Int[Array, ""]) -> Basis:
-    """Write the columns of a block into the basis, from the given row on, which is a multiple of b."""
+    """Write the b columns of a block as rows of the basis, from ``row`` on, which is a multiple of b."""
     if not isinstance(basis, tuple):
         return jax.lax.dynamic_update_slice_in_dim(accelerators.row_by_row(basis), block, row, axis=1)
     # The barrier keeps XLA from repeating the transposition for each piece.
@@ -66,11 +66,11 @@ def write(basis: Basis, block: Block, row: Int[Array, ""]) -> Basis:
 
 
 # One step of shift-invert Lanczos amplifies a block's component along a converged eigenvector 10 to 100 times. So two
-# steps amplify rounding errors to c = VᵀMx of 1e-14 to 1e-9. The sums in c need double precision, because rounding
-# would otherwise be as large as c. Single precision suffices to subtract Vc, with an error of 6e-8 c. If c is large,
-# because the shift is close to an eigenvalue, V is used in double precision.
+# steps amplify rounding errors until the components c = VᵀMx are 1e-14 to 1e-9. The sums c need double precision,
+# because their rounding errors would otherwise be as large as c. Single precision suffices to subtract Vc, with an
+# error of 6e-8 c. If c is large, because the shift is close to an eigenvalue, V is used in double precision.
 def within(basis: Basis, images: Float[Array, "n_dof c"], filled: Int[Array, ""]) -> Float[Array, "n_dof c"]:
-    """Return the projection VVᵀMx of columns x, given Mx, on the first ``filled`` vectors V of the basis."""
+    """Return VVᵀMx, the projection of columns x on the first ``filled`` basis vectors V, given ``images`` = Mx."""
     if not isinstance(basis, tuple):
         return matmul(accelerators.row_by_row(basis), gram(basis, images))
     used = [filled > at for at in _starts(basis)]
@@ -133,7 +133,7 @@ def _put(
 
 
 def recur(block: Block, image: Block, before: Block, coupling: Small, x: Block) -> tuple[Block, Small]:
-    """Orthogonalise x = (K − σM)⁻¹M · block against this block and the previous one; also return its coefficients."""
+    """Orthogonalise x = (K − σM)⁻¹M · block against the block and the one before; also return blockᵀMx."""
 
     def plain() -> tuple[Array, Array]:
         diagonal = gram(image, x)
@@ -148,7 +148,7 @@ def recur(block: Block, image: Block, before: Block, coupling: Small, x: Block) 
 
 
 def without(block: Block, image: Block, x: Block) -> Block:
-    """Orthogonalise x against M-orthonormal columns, given also their image under M."""
+    """Orthogonalise x against the M-orthonormal columns of a block, whose image under M is given."""
 
     def by_kernels() -> Array:
         return column_kernels.remainder(x, block, column_kernels.parts_of_products(image, x))[0]
@@ -159,8 +159,8 @@ def without(block: Block, image: Block, x: Block) -> Block:
 def orthonormal(mass: OfColumns, x: Block) -> tuple[Block, Block, Small]:
     """Return M-orthonormal columns y, My, and the factor R of x = yRᵀ.
 
-    The Gram matrix is factorised by its eigenvalues. Kernels use a pivoted Cholesky factorisation, which is faster
-    there. Both bound the divisors below, so that nothing becomes infinite.
+    XLA's operations factorise the Gram matrix by its eigenvalues; kernels use a pivoted Cholesky factorisation, which
+    is faster there. Both bound the divisors from below, so that no entry becomes infinite.
     """
     identity = jnp.asarray(np.eye(x.shape[1], dtype=x.dtype))  # a constant, so that no kernel computes it
 

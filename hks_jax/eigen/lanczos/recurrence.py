@@ -30,13 +30,13 @@ class ShiftedSolve(NamedTuple):
 
     factor: Factorisation  # the factorisation of K − σM
     shift: Float[Array, ""]  # σ
-    passes: Int[Array, ""] | None  # 1, or 2 with a refinement step; None is 1 without compiling the refinement
+    passes: Int[Array, ""] | None  # the number of solves, 1 or 2; if None, 1 without compiling the second
 
 
 class _Recurrence(NamedTuple):
     """The state of the recurrence."""
 
-    basis: Basis  # M-orthonormal rows: the known eigenvectors, then the blocks so far; the rest is zero
+    basis: Basis  # M-orthonormal rows: the known eigenvectors, then the blocks so far; the other rows are zero
     before: Block  # the last block in the basis
     block: Block  # the following block
     image: Block  # the image of this block under M
@@ -56,12 +56,13 @@ def block_lanczos(
 ) -> RitzPairs:
     """Run block Lanczos on (K − σM)⁻¹M, orthogonal to known eigenvectors.
 
-    The recurrence keeps consecutive blocks orthogonal. In double precision, every second step projects two blocks on
-    the whole basis. Thus the basis is read half as often, and stays M-orthonormal to rounding.
+    The recurrence keeps consecutive blocks orthogonal. In double precision, only every second step orthogonalises
+    against the whole basis, but two blocks at once. Thus the basis is read half as often, and stays M-orthonormal to
+    rounding.
     """
     state, traced = _begin(pencil, start, known, room), is_traced(shifted)
-    # Under `jit`, the loop takes `room` steps, because a length that varies within a batch would copy the whole state
-    # in every iteration.
+    # Under `jit`, the loop takes `room` steps: if the number of steps varied within a batch, every iteration would copy
+    # the whole state.
     steps = room if traced else int(steps)
     if not traced and shifted.passes is not None and int(shifted.passes) == 1:
         shifted = shifted._replace(passes=None)
@@ -96,9 +97,10 @@ def _advance(
     first: int | Array,
     last: int | Array,
 ) -> _Recurrence:
-    """Take the steps first, …, last − 1, or two steps if ``alone``. The basis has the blocks from row ``offset`` on."""
+    """Take the steps first to last − 1, or two steps if ``alone``. The blocks begin at row ``offset`` of the basis."""
     # If an eigenvalue is close to the shift, its θ may be 1000 times as large as other θ. A step amplifies the rounding
-    # error along this eigenvector by as much. So in single precision, every step projects on the whole basis.
+    # error along this eigenvector 1000 times. So in single precision, every step orthogonalises against the whole
+    # basis.
     every = 2 if state.block.dtype == jnp.float64 else 1
     two = accelerators.at_hand()
 
@@ -106,7 +108,7 @@ def _advance(
         steps = _stepping(pencil, shifted, offset)
 
         def turn(number: Array, state: _Recurrence) -> _Recurrence:
-            if two:  # statically known which of two steps projects
+            if two:  # which of the two steps projects is known statically
                 return steps(2 * number, state, (every == 1, True))
             return steps(number, state, ((number + 1) % every == 0,))
 
@@ -114,7 +116,7 @@ def _advance(
         return turn(jnp.asarray(ends[0]), state) if alone else jax.lax.fori_loop(*ends, turn, state)
 
     if two and not alone and shifted.passes is not None:
-        # The host waits for the number of passes only once, and not in each step.
+        # Then the host waits for the number of passes only once, instead of in each step.
         once = partial(advance, shifted._replace(passes=None))
         return jax.lax.cond(_in_any(shifted.passes > 1), partial(advance, shifted), once, state)
     return advance(shifted, state)
@@ -123,7 +125,7 @@ def _advance(
 def _stepping(
     pencil: SymmetricPencil, shifted: ShiftedSolve, offset: int
 ) -> Callable[[Array, _Recurrence, tuple[bool | Array, ...]], _Recurrence]:
-    """Return a function that takes steps, given the first index, the state, and whether each step projects."""
+    """Return a function that takes steps, given the index of the first, the state, and whether each step projects."""
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
     factor, shift, passes = shifted
 
@@ -138,7 +140,7 @@ def _stepping(
             x = factor.solve(rhs)
             return x + factor.solve(residual_of(x))
 
-        # A loop compiles the solve only once.
+        # With a loop, the solve is compiled only once.
         def refine(done: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
             x, residual = state
             x = x + factor.solve(residual)

@@ -2,9 +2,9 @@
 
 Each slice factorises K − σM at a shift σ slightly above the known eigenvalues. The inertia gives the number of
 eigenvalues below σ. Block Lanczos finds the eigenvectors below σ that are not known yet, and about as many above σ.
-Its basis is kept orthogonal to the known eigenvectors close to σ. Converged pairs become known. The certificate is a
-last factorisation at a shift above the wanted eigenvalues: its inertia equals the number of known eigenvalues below.
-Small slices keep orthogonalisation cheap for any number of wanted pairs.
+Its basis is kept orthogonal to the known eigenvectors close to σ. Converged pairs become known. A last factorisation,
+at a shift above the wanted eigenvalues, is the certificate: its inertia equals the number of known eigenvalues below
+the shift. Small slices keep orthogonalisation cheap for any number of wanted pairs.
 """
 
 import jax
@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.lanczos.krylov_basis import Block, orthonormal
 from hks_jax.eigen.lanczos.recurrence import RitzPairs, ShiftedSolve, block_lanczos
-from hks_jax.eigen.lanczos.slicing_state import Plan, Problem, SlicingState, Stored, crowded, make_room, steps_for
+from hks_jax.eigen.lanczos.slicing_state import Plan, Problem, SlicingState, Stored, crowded, make_room
 from hks_jax.eigen.quality import allowed_residuals, indistinct, measure_pairs
 from hks_jax.linear import lapack
 from hks_jax.linear.dissection import Dissection
@@ -62,23 +62,24 @@ def _consider(
     last = jnp.sort(state.values)[plan.wanted - 1]
     all_wanted = (known >= plan.wanted) | (last * (1 - 2 * _COPY) < state.shift)  # or just below the last multiplet
     finished = complete & (all_wanted | (negative == problem.pencil.size))  # or no more exist
-    # If the same number of eigenvalues is missing at a shift closer to the known ones, the missing ones are equal. Then
-    # search at this shift, repeatedly if necessary.
+    # If equally many eigenvalues are missing at a lower shift, the missing eigenvalues are equal. Then search at this
+    # shift, repeatedly if necessary.
     too_many = trial.sound & (missing > plan.slice_size) & (below != state.below)
     multiple = trial.sound & (missing > 2 * plan.block) & (below == state.far_below)
-    # If a multiplicity exceeds the wanted number, a part suffices; the certificate is then below the multiplet.
+    # If a multiplicity exceeds the wanted number, some of its pairs suffice; the certificate then ends below the
+    # multiplet.
     cut = multiple & jnp.isfinite(last)
     lowest = jnp.where(state.reached > 0, state.reached, problem.lowest)
     accurate = state.stuck | (trial.error <= _ERROR * _needed(problem, plan, lowest))
-    # A new shift costs a factorisation, and refined solves cost more. So refine only if a new shift is no better.
+    # A new shift takes one factorisation; refined solves take more time. So refine only if a new shift is no better.
     moves = ~(finished | too_many) & jnp.where(trial.sound, ~accurate & (state.moved < 1), state.moved < _MOVES)
 
-    # Very many eigenvalues may follow a wide gap. Then divide the bracket between the complete part and the shift.
+    # Very many eigenvalues may follow a wide gap. Then divide the range between the known eigenvalues and the shift.
     start = jnp.maximum(state.reached, state.complete_below)
     share = jnp.maximum(plan.slice_size / (2.5 * jnp.maximum(missing, 1).astype(state.shift.dtype)), 1 / 4)
     nearer = start + share * (state.shift - start)
-    # A move by 0.7 mean gaps avoids an eigenvalue of a part of the domain. The shift moves up if all eigenvalues below
-    # it are known, and otherwise down.
+    # Inertia may be uncertain if the shift is an eigenvalue of a part of the domain; a move by 0.7 mean gaps avoids
+    # this. The shift moves up if all eigenvalues below it are known, and otherwise down.
     down = state.shift - 0.7 * (state.shift - state.reached) / jnp.maximum(missing, 1).astype(state.shift.dtype)
     up = state.shift + 0.7 * _spacing(problem, plan, state)
     beside = jnp.where(jnp.where(trial.sound, missing <= 0, state.known >= plan.wanted), up, down)
@@ -110,24 +111,24 @@ def search(
     """Find the eigenpairs around the shift."""
     state, vectors = both
     shifted = ShiftedSolve(factor, state.shift, state.passes)
-    if not is_traced(state.multiple) and state.multiple:
-        order, new, following = _nearest(problem, shifted, plan, state, vectors)
-    else:
+    one_multiplet = not is_traced(state.multiple) and bool(state.multiple)
+    if not one_multiplet:
         # If one slice suffices, usually no vector is known, and the window is empty. With several slices, an empty
         # first window would need a separate compilation.
         nothing = plan.wanted <= plan.slice_size and not is_traced(state.known) and int(state.known) == 0
         known, interval, steps = _window(problem, plan, state, vectors, 0 if nothing else plan.window)
         ritz = block_lanczos(problem.pencil, shifted, state.start, known, plan.steps, steps, plan.ritz)
         (order, following), new = _accept(problem, plan, ritz, interval, state), ritz[1]
-        if not is_traced(following.stuck) and following.stuck and state.below > 0:
-            order, new, following = _nearest(problem, shifted, plan, state, vectors)
-    # A separate call, so that memory holds only the two arrays of vectors.
+        one_multiplet = not is_traced(following.stuck) and bool(following.stuck and state.below > 0)
+    if one_multiplet:
+        order, new, following = _nearest(problem, shifted, plan, state, vectors)
+    # This is a separate call, so that only two arrays of vectors are in memory at a time.
     return following, _stored(vectors, new, order, state.known)
 
 
-# Block Lanczos finds a multiple eigenvalue at most as often as a block has columns. Block Lanczos fails if the number
-# of steps exceeds that of distinct eigenvalues. Inverse iteration finds as many eigenvalues near the shift as it has
-# vectors. If a multiplicity is larger, any vectors of the eigenspace will do.
+# Block Lanczos finds at most as many pairs of a multiple eigenvalue as a block has columns. It fails if the number of
+# steps exceeds the number of distinct eigenvalues. Inverse iteration finds as many pairs near the shift as it has
+# vectors. If a multiplicity is larger, any vectors of the eigenspace suffice.
 def _nearest(
     problem: Problem, shifted: ShiftedSolve, plan: Plan, state: SlicingState, vectors: Stored
 ) -> tuple[Order, Float[Array, "ritz n_dof"], SlicingState]:
@@ -151,7 +152,7 @@ def _nearest(
 def _inverse_iteration(
     pencil: SymmetricPencil, shifted: ShiftedSolve, vectors: Stored, known: Int[Array, ""], x: Block
 ) -> tuple[Float[Array, " b"], Block, Float[Array, " b"]]:
-    """Return Ritz values, M-orthonormal Ritz vectors orthogonal to the known ones, and residuals."""
+    """Return Ritz values, M-orthonormal Ritz vectors orthogonal to the known vectors, and residuals."""
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
     x = shifted.factor.solve(mass(x))
     for _ in range(2):
@@ -181,12 +182,12 @@ def _window(
     left = jnp.maximum(plan.wanted - state.known, plan.slice_size // 4)
     # The last slice is smaller, but contains some unwanted eigenvalues, because the certificate needs a gap.
     size = jnp.where(left < plan.slice_size, left * 17 // 16 + 2 + 2 * plan.block, plan.slice_size)
-    return vectors, (low, high), jnp.minimum(steps_for(plan, size), plan.steps)
+    return vectors, (low, high), jnp.minimum(plan.steps_for(size), plan.steps)
 
 
 @jit_quickly(donate_argnames="known_vectors")
 def _stored(known_vectors: Stored, vectors: Float[Array, "ritz n_dof"], order: Order, known: Int[Array, ""]) -> Stored:
-    """Append vectors, in the given order, to the known vectors, in place."""
+    """Append ``vectors[order]`` to the known vectors, in place."""
     return jax.lax.dynamic_update_slice_in_dim(known_vectors, vectors[order], known, 0)
 
 
@@ -205,20 +206,20 @@ def _accept(
     values, residuals, _ = measure_pairs(problem.pencil, vectors)
     first_nonzero = jnp.sort(jnp.concatenate([state.values, values]))[plan.nulls]
     scale = jnp.maximum(jnp.abs(values), jnp.maximum(first_nonzero, problem.unit))
-    # If nothing converged, as on a very elongated domain, rounding exceeds the usual level, and the limit is raised.
+    # If no pair converged, as on a very elongated domain, rounding exceeds the usual level; then the limit is raised.
     excuse = jnp.where(state.stuck, _EXCUSE, 1).astype(dtype)
     allowed = allowed_residuals(scale, excuse * indistinct(problem.pencil, dtype), plan.tolerance)
     converged = (residuals <= allowed) & (theta != 0)
-    # Pairs may be missing above the first that did not converge, and farther from the shift than the examined pairs.
+    # Pairs may be missing above the first pair that did not converge, and beyond the examined pairs.
     above = near > shift
     limit = jnp.min(jnp.where(above & ~converged, near, jnp.inf))
     reach = shift + 1 / jnp.min(jnp.where(theta != 0, jnp.abs(theta), jnp.inf))
     end = jnp.minimum(jnp.minimum(limit, reach), high)
     accepted = converged & (values > low) & (values < end)
     complete = state.below == jnp.sum(state.values < shift) + jnp.sum(accepted & (values < shift))
-    # Later searches stay orthogonal to the known vectors. If these had components along missing eigenvectors, which may
-    # have much smaller eigenvalues, the missing pairs could not converge. So if pairs are missing, accept only vectors
-    # whose accuracy suffices for the missing pairs.
+    # Later searches stay orthogonal to the known vectors. If known vectors had components along missing eigenvectors,
+    # whose eigenvalues may be much smaller, the missing pairs could not converge. So if pairs are missing, accept only
+    # vectors that are accurate enough for the missing pairs.
     needed = _needed(problem, plan, jnp.maximum(state.reached, first_nonzero), excuse)
     accepted &= complete | (residuals <= needed)
 
@@ -231,8 +232,8 @@ def _accept(
     gapless = jnp.max(jnp.where((index < known) & (all_values < end), all_values, -jnp.inf), initial=0)
 
     # If eigenvalues below the shift are missing, move to the lowest Ritz value that did not converge. If all converged,
-    # a multiplet was found in part, and its place is unknown. If nothing converges from the lower end of the spectrum
-    # on, move below this end, where the matrix is definite and its factorisation most accurate.
+    # a multiplet was found only in part, and its eigenvalue is unknown. If not even the lowest pairs converge, move
+    # below the spectrum, where the matrix is definite and its factorisation most accurate.
     lowest = jnp.min(jnp.where(~converged & (values > low) & (values < shift), values, shift))
     seen, stuck = lowest < shift, ~complete & (count == 0)
     again = jnp.where(seen, lowest + (shift - lowest) / 4, (state.complete_below + shift) / 2)
@@ -279,7 +280,7 @@ def _next_shift(problem: Problem, plan: Plan, state: SlicingState) -> Scalar:
     left = (plan.wanted - jnp.sum(ordered <= state.reached)).astype(ordered.dtype)
     slices = jnp.ceil(left / plan.slice_size)
     ahead = jnp.maximum(state.reached, state.complete_below) + spacing * (left / jnp.maximum(slices, 1) / 2 + 1)
-    # The widest of the next gaps is the safest place; the gap above the last known eigenvalue is estimated.
+    # The middle of the widest gap is the safest shift; the gap above the last known eigenvalue is estimated.
     gaps = jnp.where(index < known - 1, jnp.roll(ordered, -1) - ordered, spacing)
     last_few = (index >= plan.wanted - 1) & (index < plan.wanted + 7) & (index < known)
     widest = jnp.argmax(jnp.where(last_few, gaps, -1))

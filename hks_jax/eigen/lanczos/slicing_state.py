@@ -1,6 +1,6 @@
 """The state of spectrum slicing between two slices, and the sizes of its computation."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ class Problem(NamedTuple):
     first: Float[Array, ""]  # the first shift
     spacing: Float[Array, ""]  # the expected mean gap of eigenvalues
     lowest: Float[Array, ""]  # the expected lowest nonzero eigenvalue
-    unit: Float[Array, ""]  # the lower bound of the eigenvalue in relative residuals
+    unit: Float[Array, ""]  # the least scale of relative residuals
     negative: Int[Array, ""]  # the number of negative eigenvalues, which are not wanted
 
 
@@ -40,7 +40,12 @@ class Plan(NamedTuple):
     @property
     def steps(self) -> int:
         """The maximal number of Lanczos blocks in a slice."""
-        return int(steps_for(self, self.slice_size))
+        return self.steps_for(self.slice_size)
+
+    def steps_for(self, size: Any) -> Any:
+        """Return the number of Lanczos blocks, rounded up to even, for ``size`` eigenvalues to converge."""
+        # In measurements, m Lanczos vectors in blocks of b gave about (m − 12 b)/2.1 pairs with residuals below 1e-8.
+        return 2 * -(-(21 * size + 120 * self.block) // (20 * self.block))
 
     @property
     def ritz(self) -> int:
@@ -50,9 +55,7 @@ class Plan(NamedTuple):
     @property
     def window(self) -> int:
         """The number of known eigenvectors to which a slice stays orthogonal, so that it does not find them again.
-
-        Remote eigenvectors may be omitted, because Lanczos finds near ones first. A large multiplet is found only in
-        part.
+        Eigenvectors far from the shift may be omitted, because Lanczos finds the near ones first.
         """
         size = max(self.slice_size // 4, min(self.slice_size // 2, 48))
         return -(-size // self.block) * self.block
@@ -63,25 +66,19 @@ class Plan(NamedTuple):
         return self.wanted + self.block + self.ritz
 
 
-# Measured: with m Lanczos vectors in blocks of b, about (m − 12 b)/2.1 pairs converge to 1e-8.
-def steps_for(plan: Plan, size: int | Int[Array, ""]) -> int | Int[Array, ""]:
-    """Return the number of Lanczos blocks, rounded up to even, for ``size`` eigenvalues to converge."""
-    return 2 * -(-(21 * size + 120 * plan.block) // (20 * plan.block))
-
-
 class SlicingState(NamedTuple):
     """The state between two slices, without the vectors. A pair is called known if it was computed and accepted."""
 
     values: Float[Array, " capacity"]  # known eigenvalues in the order of acceptance, padded with infinity
     known: Int[Array, ""]  # the number of known pairs
     shift: Float[Array, ""]  # the next shift
-    # the number of eigenvalues from zero to the shift, by inertia; −1 if the factorisation was too inaccurate
+    # the number of eigenvalues between zero and the shift, by inertia; −1 if the factorisation was too inaccurate
     below: Int[Array, ""]
-    multiple: Bool[Array, ""]  # whether the many missing eigenvalues are probably equal
+    multiple: Bool[Array, ""]  # whether many eigenvalues are missing that are probably equal
     far: Float[Array, ""]  # the last shift at which too many eigenvalues were missing for a search
     far_below: Int[Array, ""]  # the number of eigenvalues below `far`; 0 at first
-    reached: Float[Array, ""]  # the end of the range from zero that seems to have no missing eigenvalue
-    complete_below: Float[Array, ""]  # inertia certifies that every eigenvalue below this is known
+    reached: Float[Array, ""]  # the end of the range from zero in which no eigenvalue seems to be missing
+    complete_below: Float[Array, ""]  # inertia certifies that every eigenvalue below this number is known
     start: Float[Array, "n_dof block"]  # the start block of the next Lanczos run
     noise: Float[Array, "n_dof block"]  # independent normal random numbers
     slices: Int[Array, ""]  # the number of factorisations so far
@@ -130,7 +127,7 @@ def crowded(plan: Plan, state: SlicingState) -> Bool[Array, ""]:
 
 @jit_quickly(static_argnames="plan", donate_argnames="vectors")
 def make_room(plan: Plan, state: SlicingState, vectors: Stored) -> tuple[SlicingState, Stored]:
-    """Discard the highest known pairs, which exceed the wanted number; if stuck, all pairs above ``reached``."""
+    """Discard the highest known pairs, more than are wanted; if stuck, discard all pairs above ``reached``."""
     order = jnp.argsort(state.values)
     count = jnp.where(state.stuck, jnp.sum(state.values <= state.reached), state.known)
     count = jnp.minimum(count, plan.capacity - plan.ritz)
