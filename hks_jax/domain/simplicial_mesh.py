@@ -91,8 +91,15 @@ class SimplicialMesh(eqx.Module):
                 not positive definite (with their number and the first place); the errors of the class.
         """
         mesh = cls(vertices, cells, mask=mask)
-        of_cells = _metric_of_tensors(mesh, tensors, metric, at, interpolation)
-        given = _checked_metric(of_cells, mesh.triangulation)  # an inverse may overflow
+        check_metric_choice(metric)
+        checked_interpolation(interpolation)
+        array, edges, triangulation = real_array("tensors", mesh.restrict(tensors)), mesh._edges, mesh.triangulation
+        at_vertices = _place(array.shape, triangulation, at) == "vertices"
+        if not is_traced((array, edges)):
+            _check_tensors(np.asarray(array), np.asarray(edges), triangulation, at_vertices)
+        corners = triangulation.cells if at_vertices else np.arange(len(array))[:, None]
+        of_cells = _tangential_metric(edges, array, corners, metric, interpolation if at_vertices else "linear")
+        given = _checked_metric(of_cells, triangulation)  # an inverse may overflow
         return eqx.tree_at(lambda m: m._metric, mesh, given, is_leaf=lambda leaf: leaf is None)
 
     def __repr__(self) -> str:
@@ -212,25 +219,11 @@ def _checked_metric(metric: Any, triangulation: Triangulation) -> Float[Array, "
     return spd.symmetrise(array)
 
 
-def _metric_of_tensors(
-    mesh: SimplicialMesh, tensors: Any, metric: MetricChoice | None, at: str | None, interpolation: Interpolation
-) -> Float[Array, "n d d"]:
-    """Return the metric of tensors in space, in the basis of each cell's edges; triangles take the tangential part."""
-    check_metric_choice(metric)
-    checked_interpolation(interpolation)
-    array, edges, triangulation = real_array("tensors", mesh.restrict(tensors)), mesh._edges, mesh.triangulation
-    at_vertices = _place(array.shape, triangulation, at) == "vertices"
-    if not is_traced((array, edges)):
-        _check_tensors(np.asarray(array), np.asarray(edges), triangulation, at_vertices)
-    corners = triangulation.cells if at_vertices else np.arange(len(array))[:, None]
-    return _tangential_metric(edges, array, corners, metric, interpolation if at_vertices else "linear")
-
-
 @numpy_where_known(static_argnums=(3, 4))
 def _tangential_metric(
     xp: Any, edges: Any, tensors: Any, corners: Any, metric: MetricChoice, interpolation: Interpolation
 ) -> Any:
-    """Return the metric of cells with edges (n, 3, d), from tensors in space at their corners (n, c)."""
+    """Return the metric of cells in the basis of their edges (n, 3, d), from tensors in space at corners (n, c)."""
     frames, symmetric = _orthonormal(xp, edges), 0.5 * (tensors + xp.swapaxes(tensors, -1, -2))
     across = xp.swapaxes(frames, -1, -2)
     parts = matmul(across[:, None], symmetric[corners], frames[:, None])

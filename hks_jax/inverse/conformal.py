@@ -111,9 +111,7 @@ def conformal_information(unknowns: Nodal, mass: InnerProduct, times: Float[Arra
     grid, nodes = unknowns.init.grid, unknowns.nodes.value
     relative = mass.apply(unknowns.start() + 1)
     at_nodes = jnp.zeros(grid.size, relative.dtype).at[nodes].set(relative[:, 0]).reshape(grid.shape)
-    # The metric outside the domain is arbitrary, because no edge leads there.
-    metric = jnp.where(grid.inside[..., None, None], unknowns.init.domain_tensors, jnp.eye(grid.dimension))
-    inverse = spd.inverse(metric)
+    inverse = spd.inverse(unknowns.init.domain_tensors)
     weights, rows = [], jnp.zeros_like(at_nodes)
     for axis in range(grid.dimension):
         size, along = (jnp.moveaxis(x, axis, 0) for x in (at_nodes, inverse[..., axis, axis]))
