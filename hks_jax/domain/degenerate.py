@@ -61,7 +61,7 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
     tensors = nodal.astype(np.float64)
     v = np.stack([tensors[..., 0, 0] - tensors[..., 1, 1], 2 * tensors[..., 0, 1]], axis=-1)
     active = active_elements(grid.inside, (False, False))
-    # A vector is zero up to rounding if its length is at most this value.
+    # A vector is zero up to rounding if its length is at most `tiny`.
     tiny = 16 * np.finfo(nodal.dtype).eps * np.trace(tensors, axis1=-2, axis2=-1)
     winding, crossed, on_rim = _windings(v, tiny, active)
     cells = np.argwhere(active & ((winding != 0) | crossed))

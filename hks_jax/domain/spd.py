@@ -67,7 +67,7 @@ def metric_of_diffusion(tensors: Any, metric: str) -> Any:
 
 
 def cholesky(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
-    """Return the lower triangular L with T = LLᵀ for positive semidefinite T. A column with the pivot zero is zero."""
+    """Return the lower triangular L with T = LLᵀ for positive semidefinite T. Columns with a zero pivot are zero."""
     factor = jnp.zeros_like(tensors)
     for j in range(tensors.shape[-1]):
         column = tensors[..., j] - jnp.sum(factor * factor[..., j, None, :], axis=-1)

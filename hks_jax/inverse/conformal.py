@@ -73,10 +73,11 @@ _POWER, _REACH = 3, 9.0
 """The preconditioner (1 + λt/9)³ took nearly the fewest steps of all such powers on 32² and 64² nodes."""
 
 
-# In the plane T = (1 + εu) I has the Laplacian (1 − εu) Δ and the area element (1 + εu) dx. By Duhamel's formula its
-# signature is h₀ (1 + εv) with h₀ = 1/(4πt). For u = exp(iξx) and x = t|ξ|²,
+# In the plane the metric (1 + εu) I has the Laplacian (1 − εu) Δ and the area element (1 + εu) dx. By Duhamel's formula
+# its signature is h₀ (1 + εv) with h₀ = 1/(4πt). For u = exp(iξx) and x = t|ξ|²,
 #
 #     v = a(x) u,    a(x) = ∫₀¹ (1 + x (1 − s)²) exp(−x s (1 − s)) ds − 1.
+#
 # For small x, a(x) is x/6, the contribution tK/3 of the curvature; for large x it is of order 1/x. So JᵀJ is about
 # Σₜ wₜ a(tL)², where L is the Laplacian. Except for the first few, the eigenvalues of JᵀJ decrease as those of L
 # increase. On a grid they decrease faster, because interpolation between nodes damps oscillations of the factor.

@@ -118,8 +118,7 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _State]):
         moved, curvature = change > 0, -jnp.vdot(step, state.gradient)
         damped = jnp.vdot(step, self.inner_product.apply(step)) / jnp.where(curvature > 0, curvature, 1)
         damped = jnp.where(moved & (curvature > 0), damped, jnp.inf)
-        # The distance to the solution is estimated by the step or, if larger, by the rest of the geometric series that
-        # begins with the last two steps.
+        # The step or, if larger, the rest of a geometric series from the last two steps estimates the distance left.
         ratio = change / state.change
         settled = moved & (ratio < 1) & (change * jnp.maximum(1, ratio / (1 - ratio)) < 1)
         # The next step may be the last: it is below the tolerance if the steps keep shrinking at this rate.

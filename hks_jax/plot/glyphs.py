@@ -76,7 +76,7 @@ def ellipses(
     half_axes = eigenvalues**power
     longer = 0 if kind == "metric" else 1
     axis = vectors[:, :, longer]
-    # The bounding box of the ellipse has the half sides √((T^±1)_aa).
+    # The bounding box of the ellipse has the half widths √((T^±1)_aa).
     box = np.sqrt(np.einsum("nai,ni->na", vectors**2, half_axes**2))
     scale = 0.5 * FILL / np.max(box / (np.array(steps) * grid.spacing), axis=1)
     if sizes == "common":
