@@ -62,7 +62,7 @@ class _Moments(eqx.Module):
 # tetrahedron; each δ has the covariance Σ. Let y be the four maps at D + sδ. The δ add up to zero, so the mean of y
 # minus the value is of second order, and its expectation is s² times the bias. Up to second order, we have
 # y₁ + y₂ − y₃ − y₄ = 4sJη₁/√3; similar formulas give Jη₂ and Jη₃. So four maps give three samples, whereas two
-# antithetic pairs give two. A quadratic form of one δ has the second-order variance; the mean of four has a third of it.
+# antithetic pairs give two. A quadratic form of one δ has the second-order variance; the mean of four has a third.
 @jax.jit
 def _parts(maps: list[Any], value: Any) -> tuple[Any, Any]:
     """Return the samples Jη (3, …) of the noise of the value, and the even part, whose expectation is the bias."""
