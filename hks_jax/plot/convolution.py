@@ -133,8 +133,7 @@ def line_integral_convolution(
     shift = contrast * (2 * texture.T - 1)
     shade = np.zeros((*shift.shape, 4))
     if ax.images:
-        # Black at the opacity p multiplies a colour by 1 − p. White multiplies the colour's distance to white by 1 −
-        # p.
+        # Black of opacity p multiplies a colour by 1 − p. White multiplies the colour's distance to white by 1 − p.
         shade[..., :3] = (shift > 0)[..., None]
         shade[..., 3] = np.abs(shift)
     else:
