@@ -104,12 +104,12 @@ def inversion() -> Iterator[dict]:
         value_first_s, value_s, _ = timed_from_cold(eqx.filter_jit(loss), pencil, repeats=1)
         run = eqx.filter_jit(eqx.filter_grad(loss))
         gradient_first_s, gradient_s, _ = timed_from_cold(run, pencil, repeats=1)
-        cost = inversion_cost(dissect(pencil.pattern))
+        operations, entries = inversion_cost(dissect(pencil.pattern))
         yield {
             "domain": name,
             "nodes": pencil.size,
-            "gflop_a_pole": cost.operations / 1e9,
-            "factors_GB": 16 * cost.entries / 1e9,
+            "gflop_a_pole": operations / 1e9,
+            "factors_GB": 16 * entries / 1e9,
             "value_s": value_s,
             "value_first_s": value_first_s,
             "gradient_s": gradient_s,

@@ -8,7 +8,7 @@ examples:
   hks-jax hks --help
 """
 
-# This is the command line `hks-jax`. It reports an error as one line on stderr and as an exit code.
+# The command line reports an error as one line on stderr and as an exit code.
 
 import _thread
 import argparse
@@ -34,7 +34,7 @@ COMMANDS = (hks, spectrum, curvature, fit, batch, stats, plot, explore, info, co
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 
-# Errors that users can correct: wrong values, missing files, missing extras. Other errors mean a failed computation.
+# Users can correct these errors: wrong values, missing files, missing extras. Other errors mean a failed computation.
 INPUT_ERRORS = (ValueError, FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError, ImportError)
 
 
@@ -61,8 +61,8 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code: 0 success, 1 failed computation, 2 bad input, 130 interrupt.
 
-    Output files are written atomically and together at the end, so there are none unless the exit code is 0. Exceptions
-    are `paper`, `batch`, the checkpoint of `fit` and the eigenpairs that `hks` saves.
+    Output files are written atomically and together at the end, so a failed command writes none. Exceptions are the
+    files of `paper` and `batch`, the checkpoint of `fit` and the eigenpairs of `hks`.
     """
     argv, parser = sys.argv[1:] if argv is None else argv, build_parser()
     if not argv:

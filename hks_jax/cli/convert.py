@@ -41,4 +41,4 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         progress.warn(f"{invalid} tensors are not positive definite and are written unchanged; see --repair")
     with progress.stage("writing", str(args.output)):
         save_tensors(args.output, volume, provenance={"command": sys.argv, "repair": dict(volume.repair) or None})
-    return Done([args.output], {**describe_input(volume, volume.mask), "not_positive_definite": invalid})
+    return Done([args.output], {**describe_input(volume), "not_positive_definite": invalid})

@@ -20,10 +20,10 @@ from hks_jax.cli.job import Settings, describe_input, field_of
 from hks_jax.cli.options import READING
 from hks_jax.cli.outputs import Done, writing
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import image_suffix, read_volume
+from hks_jax.cli.reading import read_volume
 from hks_jax.curvature import gaussian_curvature
 from hks_jax.io import Result
-from hks_jax.io.formats import WRITTEN
+from hks_jax.io.formats import WRITTEN, format_of
 
 OPTIONS = f"""
 @file @metric {READING} @domain @dtype @output
@@ -32,7 +32,7 @@ OPTIONS = f"""
 """
 
 COLOURED = 0.98
-"""The quantile of absolute values at the ends of the colour scale; differences of noisy tensors have outliers."""
+"""The quantile of absolute values at the ends of the colour scale; the curvature of noisy tensors has outliers."""
 
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
@@ -47,7 +47,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
             "curvature. Choose a slice, such as --slice z=14"
         )
     field = field_of(volume, volume.grid(args.components), settings)
-    inside = field.grid.inside
+    volume, inside = volume.with_mask(field.grid.mask), field.grid.inside
     with progress.stage("curvature", f"{int(inside.sum())} nodes"):
         curvature = np.asarray(gaussian_curvature(field, ["x" in periodic, "y" in periodic]))
     known = np.isfinite(curvature)
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     density = np.sqrt(np.linalg.det(np.asarray(field.domain_tensors, np.float64)))[known]
     values = curvature[known].astype(np.float64)
     report = {
-        "input": describe_input(volume, field.grid.mask),
+        "input": describe_input(volume),
         "settings": {"metric": settings.metric, "periodic": periodic, "dtype": settings.dtype},
         "curvature": {
             "nodes": int(known.sum()),
@@ -69,11 +69,10 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
             "total": float(values @ density * np.prod(field.grid.spacing)),
         },
     }
-    volume = volume.with_mask(field.grid.mask)
     stale = [args.output / f"curvature{suffix}" for suffix in WRITTEN]
     with writing(args.output, report, progress, lambda: stale) as (folder, done):
         result = Result(volume, curvature[None], np.zeros(0), report=report, name="curvature")
-        result.save(folder / "curvature", image_suffix(args.file))
+        result.save(folder / "curvature", format_of(args.file).image)
         grid, box = cropped(volume, known)
         limit = float(np.quantile(np.abs(values), COLOURED)) or 1.0
         style: dict[str, Any] = {"cmap": "RdBu_r", "limits": [(-limit, limit)], "label": "in 1/length² of the metric"}

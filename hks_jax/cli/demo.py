@@ -11,7 +11,6 @@ examples:
 
 import argparse
 import importlib.util
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -39,7 +38,7 @@ RIM = 2
 SPREADS = 2.5 * 2 ** (np.arange(7) / 2)
 """The diffusion lengths √(Dt) at the drawn times, in voxels, from one voxel to the size of the brain."""
 N_PAIRS = 600
-"""The number of eigenpairs, for both boundary problems together, that the first time needs."""
+"""The number of eigenpairs of both boundary problems together that the smallest time needs."""
 PHANTOM_SHAPE = (72, 80)
 
 
@@ -52,10 +51,8 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         progress.note('using a phantom, because the brain needs the wheel mdt==1.2.7 and pip install "hks-jax[dti]"')
         brain = None
     if brain is None:
-        tensors, mask, spacing = map(np.asarray, examples.phantom(PHANTOM_SHAPE))
-        h = tuple(np.broadcast_to(spacing, (2,)).astype(float).tolist())
-        volume = TensorVolume(tensors, h, (0.0, 0.0), mask.astype(bool), source="phantom")
-        volume = replace(volume, length_unit="mm", unit=MM2_PER_S)
+        tensors, mask, spacing = examples.phantom(PHANTOM_SHAPE)
+        volume = TensorVolume(tensors, spacing, (0.0, 0.0), mask, source="phantom", length_unit="mm", unit=MM2_PER_S)
     else:
         with progress.stage("tensor fit", f"{brain.images.name}, b ≤ {B_MAX:g} s/mm²"):
             volume = fit_dwi(brain.images, brain.bval, brain.bvec, brain.mask, b_max=B_MAX).slice("z", 0)

@@ -24,10 +24,10 @@ from hks_jax.cli.job import ComputationError, use_dtype
 from hks_jax.cli.options import FORMATS, refuse
 from hks_jax.cli.outputs import Done, writing
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import image_suffix
 from hks_jax.fem.boundary import unreached_sides
 from hks_jax.io import read_tensors, save, save_tensors
-from hks_jax.io.result import Result, plain, recorded_boundary
+from hks_jax.io.formats import format_of
+from hks_jax.io.result import Result, plain, tuples
 from hks_jax.io.volume import digest
 
 OPTIONS = f"""
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
     if args.init is None:
         refuse(args, ("metric", "order"), "this option describes the tensors in --init, which is missing; pass both")
-    elif args.metric is None and image_suffix(args.init):
+    elif args.metric is None and format_of(args.init).image:
         raise ValueError(
             "--metric: choose inverse, tensor or adjugate, because --init has diffusion tensors and not a metric"
         )
@@ -84,7 +84,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         grid = target.grid
         init = _initial(args, grid, progress)
         if args.boundary is None:
-            recorded = recorded_boundary(target.settings)
+            recorded = tuples(target.settings.get("boundary"))
             args.boundary = recorded or "neumann"
             origin = "recorded in the target" if recorded else "the default, because the target records none"
             progress.note(f"boundary {json.dumps(args.boundary)} ({origin})")

@@ -38,9 +38,10 @@ from hks_jax.cli.noise import Noisy, noise_of_volume, require_spectral, signatur
 from hks_jax.cli.options import READING, SOLVING, options_in, refuse
 from hks_jax.cli.outputs import PAIRS, Done, of_earlier, write_outputs
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import image_suffix, read, read_volume, require_metric
+from hks_jax.cli.reading import read, read_volume, require_metric
 from hks_jax.fem.assembly import MESH_BOUNDARIES
 from hks_jax.io import read_mask, read_mesh, read_mesh_arrays, sample_tensors
+from hks_jax.io.formats import format_of
 from hks_jax.io.mesh import WRITTEN, is_mesh
 from hks_jax.io.repair import require_valid
 from hks_jax.io.result import Result
@@ -90,12 +91,12 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         solved, image = saved_pairs.read_pairs(args.file, settings, progress)
         volume = solved.volume
     else:
-        volume, image = read_volume(args, progress), image_suffix(args.file)
+        volume, image = read_volume(args, progress), format_of(args.file).image
     if volume.dimension == 2:
         refuse(args, ("through",), "this option is for a volume; leave it out for a slice")
     if not saved:
         solved = compute_pairs(volume, settings, progress)
-    if args.save_pairs:  # at once, because later steps may fail
+    if args.save_pairs:  # before later steps, which may fail
         with progress.stage("writing", str(args.output / PAIRS)):
             for file in of_earlier(args.output, np.asarray(solved.pairs.eigenvalues), progress):
                 file.unlink(missing_ok=True)
@@ -128,7 +129,7 @@ def _on_mesh(args: argparse.Namespace, settings: Settings, progress: Progress) -
 
 
 def _check_mesh_options(args: argparse.Namespace) -> None:
-    """Raise ValueError for options that only grids have, and if the metric of given tensors is not chosen."""
+    """Raise ValueError for options that only grids have, and for tensors without --metric."""
     if args.tensors and args.array:
         raise ValueError("--tensors, --array: got both; expected tensors either in a volume or at the mesh's vertices")
     of_grids = ["slice", "through", "view", "save_pairs", "components", "method"]

@@ -27,11 +27,10 @@ from hks_jax.cli.reading import read
 from hks_jax.domain.components import label_nodes
 from hks_jax.domain.simplices import WORDS, signed_measure
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
-from hks_jax.domain.tensor_checks import MANY
+from hks_jax.domain.tensor_checks import MANY, unsymmetric
 from hks_jax.fem.boundary import BoundarySpec, default_boundary
 from hks_jax.io import TensorVolume, find_invalid, read_mesh
 from hks_jax.io.mesh import is_mesh
-from hks_jax.io.repair import find_unsymmetric
 from hks_jax.io.result import NAMES, Result, signature_file
 from hks_jax.io.units import MM2_PER_S, by_axis, is_plausible
 from hks_jax.io.volume import digest
@@ -53,7 +52,7 @@ def run(args: argparse.Namespace, progress: Progress) -> None:
 
 
 def _result_of(path: Path) -> Result | None:
-    """Return the result in a file or a folder, or beside its image; None for other files."""
+    """Return the result in an npz, in its folder, or in the npz beside its image; None for other files."""
     file = signature_file(path) if path.is_dir() else Path(str(path).removesuffix(".gz")).with_suffix(".npz")
     return Result.read(file) if arrays_in(file).intersection(NAMES) else None
 
@@ -76,7 +75,7 @@ def _describe_result(result: Result) -> dict[str, Any]:
 
 
 def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = None) -> dict[str, Any]:
-    """Return facts about a volume for JSON; if `boundary` is None, for its default boundary condition."""
+    """Return facts about a volume for JSON. If `boundary` is None, `default_boundary` determines suitable k and t."""
     inside, bad = volume.inside, find_invalid(volume)
     boundary = default_boundary(inside)[0] if boundary is None else boundary
     good = inside & ~bad
@@ -96,7 +95,7 @@ def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = N
         "boundary": boundary,
         "component_sizes": np.sort(np.bincount(labels.ravel())[1:])[::-1][:10].tolist(),
         "not_positive_definite": int(bad.sum()),
-        "not_symmetric": int(find_unsymmetric(volume).sum()),
+        "not_symmetric": int((inside & unsymmetric(volume.tensors)).sum()),
     }
     wrong = volume.invalid_by_order
     if bad.any() and wrong is not None and wrong.fewer:
@@ -141,7 +140,7 @@ def _plain(value: Any) -> str:
 
 
 def _lines(description: dict[str, Any]) -> list[str]:
-    if "sha256" not in description:  # of a result
+    if "sha256" not in description:  # a result has no digest
         return [f"{name:<16}{_plain(value)}" for name, value in description.items() if value]
     lines = [f"{description['file']}: {description['format']}, SHA-256 {description['sha256'][:16]}…"]
     if "vertices" in description:

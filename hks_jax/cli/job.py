@@ -32,7 +32,7 @@ class ComputationError(RuntimeError):
 class Settings:
     """The settings of a computation, with the names of the options.
 
-    The metric is None only for meshes. The boundary None means `default_boundary` for a volume, natural for a mesh.
+    The metric is None only for meshes. The boundary None means `default_boundary` for a volume, neumann for a mesh.
     """
 
     metric: MetricChoice | None
@@ -48,33 +48,23 @@ class Settings:
 
     @classmethod
     def of(cls, args: argparse.Namespace | None = None, **given: Any) -> "Settings":
-        """Return the settings in `args`, or the defaults, where `given` replaces some."""
+        """Return the settings in `args`, or else the default settings; settings in `given` replace some of them."""
         chosen = vars(defaults(f"@metric {SOLVING} @signature")) | (vars(args) if args else {})
         given = {"metric": chosen["metric"] or "tensor", "times": parse_times(chosen["times"]), **given}
         return cls(**{field.name: chosen[field.name] for field in fields(cls)} | given)
 
 
 class Solved(NamedTuple):
-    """The eigenpairs of a volume or slice, its metric, and the settings, whose boundary is not None."""
+    """The eigenpairs and the metric of a volume whose mask is the domain, and settings whose boundary is not None."""
 
     volume: TensorVolume
     field: hj.TensorField
     pairs: hj.Eigenpairs
     settings: Settings
 
-    @property
-    def domain(self) -> TensorVolume:
-        """The volume, with the domain as its mask."""
-        return self.volume.with_mask(self.field.grid.mask)
-
-    @property
-    def described(self) -> dict[str, Any]:
-        """The entries of a report about the tensors."""
-        return describe_input(self.volume, self.field.grid.mask)
-
 
 def use_dtype(dtype: str) -> None:
-    """Enable float64 in JAX if `dtype` is ``"float64"``; applications do so before they create arrays."""
+    """Enable float64 in JAX if `dtype` is ``"float64"``; call it before arrays are created."""
     if dtype == "float64":
         jax.config.update("jax_enable_x64", True)
 
@@ -95,7 +85,7 @@ def result_of(
 
 
 def automatic_times(pairs: hj.Eigenpairs, n: int) -> tuple[float, ...]:
-    """Return n default times; at the last, √t is about half the length of the domain."""
+    """Return n default times; at the last time, √t is about half the length of the domain."""
     return tuple(np.asarray(hj.default_times(pairs, n, math.exp(-LAST)), np.float64).tolist())
 
 
@@ -118,7 +108,8 @@ def compute_pairs(volume: TensorVolume, settings: Settings, progress: Progress) 
             progress.warn(message)
         field = field_of(volume, grid, settings)
         pencil = hj.assemble(field, boundary)
-    return Solved(volume, field, solve(pencil, settings, progress), replace(settings, boundary=boundary))
+    pairs = solve(pencil, settings, progress)
+    return Solved(volume.with_mask(grid.mask), field, pairs, replace(settings, boundary=boundary))
 
 
 def solve(pencil: hj.Pencil | hj.MirrorPencil, settings: Settings, progress: Progress) -> hj.Eigenpairs:
@@ -166,18 +157,14 @@ def _report(settings: Settings, pairs: hj.Eigenpairs, times: tuple[float, ...]) 
     }
 
 
-def describe_input(volume: TensorVolume, mask: np.ndarray | None) -> dict[str, Any]:
-    """Return the entries of a report about the tensors, where `mask` is the domain."""
-    about = {name: getattr(volume, name) for name in ("shape", "spacing", "length_unit", "unit")}
+def describe_input(volume: TensorVolume) -> dict[str, Any]:
+    """Return the entries of a report about the tensors of a volume, whose mask is the domain."""
+    names = ("source", "shape", "spacing", "length_unit", "unit", "order", "frame", "notes")
     return {
-        "source": volume.source,
+        **{name: getattr(volume, name) for name in names},
         "sha256": volume.digest,
-        **about,
         "median_mean_diffusivity": median_mean_diffusivity(volume),
-        "order": volume.order,
-        "frame": volume.frame,
-        "voxels_inside": int(np.prod(volume.shape) if mask is None else mask.sum()),
-        "notes": list(volume.notes),
+        "voxels_inside": int(volume.inside.sum()),
         "repair": dict(volume.repair) or None,
     }
 

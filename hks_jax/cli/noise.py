@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import hks_jax as hj
-from hks_jax.cli.job import Settings, Solved, automatic_times, result_of
+from hks_jax.cli.job import Settings, Solved, automatic_times, describe_input, result_of
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read_volume
 from hks_jax.cli.values import Times
@@ -21,7 +21,7 @@ from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result
 
 _CANDIDATES = 4
-"""The number of candidates per automatic time."""
+"""The number of candidate times for each automatic time."""
 _SIGNAL = 1.0
 """The signal-to-noise ratio at which automatic times begin."""
 _RIM = 0.1
@@ -61,7 +61,7 @@ def second_scan(args: argparse.Namespace) -> argparse.Namespace | None:
 def signature_of(args: argparse.Namespace, solved: Solved, progress: Progress) -> Result:
     """Compute the signature of a volume or slice from its eigenpairs, with error bars if ``--noise`` is given."""
     volume, field, pairs, settings = solved
-    of_pairs = partial(result_of, solved.domain, solved.described, pairs)
+    of_pairs = partial(result_of, volume, describe_input(volume), pairs)
     if getattr(args, "noise", None) is None:
         return of_pairs(settings, progress)
 
@@ -123,8 +123,8 @@ def _error_bars(
     """Return error bars, the sampled noise (n_draws, n_times, *shape), the interior (n_times, *shape), and the times.
 
     For the boundary ``"mean"``, the interior contains the nodes with little influence of the boundary, and is empty at
-    times with few such nodes. For other boundaries, it is the whole domain. Automatic times begin at the first with a
-    sufficient signal-to-noise ratio.
+    times with few such nodes. For other boundaries, it is the whole domain. Automatic times begin at the first time
+    with a sufficient signal-to-noise ratio.
     """
     wanted = settings.times.automatic
     times = settings.times.explicit or automatic_times(pairs, _CANDIDATES * wanted)
@@ -139,7 +139,7 @@ def _error_bars(
         maps.append(np.asarray(one, np.float32))
 
     with progress.stage("error bars", f"{args.draws} noisy maps"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", hj.AccuracyWarning)  # some warnings concern unused times
+        warnings.simplefilter("ignore", hj.AccuracyWarning)  # some warnings concern candidate times that are not chosen
         tensors, more = noisy.tensors.astype(settings.dtype), {"draws": args.draws, "each": keep}
         more |= {"compiled": noisy.traceable, "progress": progress.update}
         bars = hj.uncertainty(signature, tensors, noisy.noise, method="resample", **more)
@@ -151,7 +151,7 @@ def _error_bars(
     chosen = np.arange(len(times))
     if not settings.times.explicit:
         ratio = np.asarray(bars.signal_to_noise_at(interior))
-        ratio = np.where(np.isfinite(ratio), ratio, np.asarray(bars.signal_to_noise))  # for an empty interior
+        ratio = np.where(np.isfinite(ratio), ratio, np.asarray(bars.signal_to_noise))  # if the interior is empty
         clear = np.flatnonzero(ratio >= _SIGNAL)
         first = min(int(clear[0]), len(times) - wanted) if clear.size else 0
         chosen = np.rint(np.linspace(first, len(times) - 1, wanted)).astype(int)

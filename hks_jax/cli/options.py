@@ -1,6 +1,6 @@
 """The table of all options, which defines the parsers, the settings, the columns of studies and the reference page.
 
-A line of the table defines an option: its flags, its value, its default, and after two spaces its help text, which
+A line of the table defines an option by its flags, its value, its default and, after two spaces, its help text, which
 indented lines continue. ``N...`` means one or more values, ``N!`` a required value, and ``a|b`` a choice. An option
 without a value is a switch. A line ``[name] title: text`` begins a section, and ``@name`` includes a section in the
 options of a command (`OPTIONS` in its module).
@@ -37,7 +37,7 @@ file FILE...
 --slice AXIS=N  one slice, such as z=14, instead of the volume
 --mask FILE  zeros and ones in NIfTI, MRtrix, NRRD, .npy, or in the array 'mask' of an .npz
 --background outside|inside
-    the treatment, without --mask, of voxels that a program filled with equal isotropic tensors or tensors near zero:
+    without --mask, whether voxels that a program filled with equal isotropic tensors, or with tensors near zero, are
     outside or inside the domain (default: inside, with a warning; zero tensors are always outside)
 --erode N = 0  remove N layers of voxels from the boundary of the mask
 [numbers] meaning of the numbers: needed only if the file does not declare it. Wrong axes mirror the tensors.
@@ -53,12 +53,13 @@ file FILE...
 --confidence C = 0.5  confidence above which voxels of NRRD's masked tensors are inside
 [invalid] tensors that are not positive definite: by default, they raise an error
 --repair HOW[:FLOOR]
-    repair of a few tensors: clip raises their eigenvalues to FLOOR (1 % of the median mean eigenvalue), mask leaves
-    their voxels out, nearest uses the nearest valid tensor. With FLOOR, tensors with a smaller eigenvalue are repaired
+    repair of a few tensors: clip raises their eigenvalues to FLOOR (default: 1 % of the median of mean eigenvalues),
+    mask leaves their voxels out, nearest uses the nearest valid tensor. With FLOOR, tensors with an eigenvalue below
+    FLOOR are also repaired
 --positive HOW:NUMBER
     map for tensors T that are naturally indefinite, such as stress: exp:S uses exp(T/S) and shift:C uses T + C·I as the
     metric; combine it with --metric tensor
-[dwi] diffusion-weighted images: DIPY fits the tensors. Without --mask, its median_otsu finds the brain.
+[dwi] diffusion-weighted images: DIPY fits the tensors. Without --mask, DIPY's median_otsu finds the brain.
 --bval FILE  b-values, in s/mm2 unless --unit is given
 --bvec FILE
     gradient directions of length 1 in three rows or three columns, as dcm2niix writes them (see --bvec-frame)
@@ -152,7 +153,7 @@ class Option(NamedTuple):
         if word.endswith("..."):
             settings["nargs"], word = "+", word[:-3]
         kind = word.split("|") if "|" in word else KINDS.get(word, str)
-        if flags == "output":  # the file of convert
+        if flags == "output":  # for convert, OUT is a file
             kind = Path
         if not word:
             settings["action"] = "store_true"
@@ -208,7 +209,7 @@ def options_in(text: str) -> list[Option]:
 
 
 SPELLED = [option.name for option in options_in(f"{READING} @metric {SOLVING} @signature")]
-"""The options that correspond to arguments of the library."""
+"""The names of options that correspond to arguments of the library."""
 
 
 def add_options(parser: argparse.ArgumentParser, text: str) -> None:
@@ -256,7 +257,7 @@ def as_options(message: str, names: Iterable[str] = SPELLED) -> str:
 FILES = [o.name for o in options_in("@voxels @dwi @atlas @names") if o.settings.get("type") is Path]
 """Options whose values are files of a subject."""
 COLUMNS = [o.flags[-1][2:] for o in options_in(f"{READING} @noise") if o.name not in FILES]
-"""Columns in a table of subjects with the meaning of the option of the same name (for reading tensors and noise)."""
+"""The columns of a table of subjects that have the meaning of the option with the same name."""
 
 _LISTS = {"meshes": MESHES, "written": WRITTEN, "files": FILES, "columns": COLUMNS}
 

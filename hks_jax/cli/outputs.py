@@ -7,7 +7,7 @@ import platform
 import sys
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,7 +26,7 @@ _OPTIONAL = ("nibabel", "dipy", "pynrrd", "vtk", "meshio")
 
 
 class Done(NamedTuple):
-    """The output of a command: the names of its files, or a text in place of the names, and a summary for JSON."""
+    """The output of a command: its files, a summary for JSON, and a text to print in place of the files' names."""
 
     files: list[Path]
     summary: dict[str, Any]
@@ -46,9 +46,9 @@ def show(args: argparse.Namespace, done: Done) -> None:
 def writing(
     folder: Path, report: Mapping[str, Any], progress: Progress, stale: Callable[[], Iterable[Path]] = tuple
 ) -> Iterator[tuple[Path, Done]]:
-    """Yield a temporary folder, and a `Done` to which the report and the paths of the results are added at the end.
+    """Yield a temporary folder and a `Done`; the report and the paths of the results are added to it at the end.
 
-    Then the function also writes report.json, moves all files to `folder` atomically, and deletes the `stale` files.
+    Then report.json is also written, all files are moved to `folder` atomically, and the `stale` files are deleted.
     """
     done = Done([], {})
     with progress.stage("writing", str(folder)), atomic_folder(folder, stale) as temporary:
@@ -70,7 +70,7 @@ def write_outputs(folder: Path, result: Result, progress: Progress, draw: Callab
 
 
 def of_earlier(folder: Path, eigenvalues: np.ndarray, progress: Progress) -> list[Path]:
-    """Return the files of an earlier signature in a folder, without a file of eigenpairs with these eigenvalues."""
+    """Return the files of an earlier signature in a folder, except eigenpairs with these eigenvalues."""
     found, own, pairs = [], [], folder / PAIRS
     if signature_file(folder).is_file():  # otherwise, another program wrote the files
         regions = ("regions.json", "regions.tsv") if (folder / "regions.json").is_file() else ()
@@ -92,8 +92,6 @@ def versions() -> dict[str, str]:
     python, system, device = platform.python_version(), platform.platform(), jax.devices()[0].device_kind
     versions = {"python": python, "system": system, "device": device}
     for package in ("hks-jax", "jax", "jaxlib", "optimistix", "numpy", "scipy", "matplotlib", *_OPTIONAL):
-        try:
+        with suppress(importlib.metadata.PackageNotFoundError):
             versions[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            continue
     return versions

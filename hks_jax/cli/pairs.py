@@ -1,4 +1,4 @@
-"""Write and read eigenpairs together with their field, for ``hks-jax hks --save-pairs`` and ``hks-jax hks PAIRS``."""
+"""Write and read eigenpairs with their tensors, for ``hks-jax hks --save-pairs`` and ``hks-jax hks PAIRS``."""
 
 import json
 import zipfile
@@ -14,7 +14,7 @@ from hks_jax.cli.job import Settings, Solved, field_of
 from hks_jax.cli.progress import Progress
 from hks_jax.io.arrays import place_of, volume_of
 from hks_jax.io.pairs import pairs_of, save_pairs
-from hks_jax.io.result import plain, recorded_boundary
+from hks_jax.io.result import plain, tuples
 from hks_jax.storage import load_npz
 
 _RECORD = "field_record"
@@ -33,7 +33,7 @@ def arrays_in(path: Path) -> set[str]:
 
 
 def is_saved_pairs(path: Path) -> bool:
-    """Return whether a file contains eigenpairs with their field."""
+    """Return whether a file contains eigenpairs with their tensors."""
     return _RECORD in arrays_in(path)
 
 
@@ -42,7 +42,7 @@ def write_pairs(path: Path, solved: Solved, image: str, warnings: Sequence[str],
 
     The file also contains the suffix of images, the warnings, and the fingerprint of a study's subject.
     """
-    volume, settings = solved.domain, asdict(solved.settings)
+    volume, settings = solved.volume, asdict(solved.settings)
     record = {name: getattr(volume, name) for name in _ABOUT}
     record |= {"image": image, "warnings": warnings, "fingerprint": fingerprint}
     record["settings"] = {name: settings[name] for name in settings if name in _SETTLED}
@@ -50,7 +50,7 @@ def write_pairs(path: Path, solved: Solved, image: str, warnings: Sequence[str],
 
 
 def are_of(path: Path, fingerprint: str) -> bool:
-    """Return whether a file contains eigenpairs with the same fingerprint, that is of the same files and settings."""
+    """Return whether a file contains eigenpairs with this fingerprint of input files and settings."""
     if not is_saved_pairs(path):
         return False
     with np.load(path) as arrays:  # reads only the array that is used
@@ -58,13 +58,12 @@ def are_of(path: Path, fingerprint: str) -> bool:
 
 
 def read_pairs(path: Path, settings: Settings, progress: Progress) -> tuple[Solved, str]:
-    """Return the eigenpairs with `settings` (and with the settings that the file determines), and the image suffix."""
+    """Return saved eigenpairs and the suffix of images; settings in the file replace settings in `settings`."""
     arrays = load_npz(path)
     record: dict[str, Any] = json.loads(str(arrays[_RECORD]))
     about = {name: record[name] for name in _ABOUT if name in record} | {"notes": tuple(record["notes"])}
     volume = volume_of(str(path), arrays, arrays["tensors"], **about)
-    boundary = recorded_boundary(record["settings"])
-    assert boundary is not None
+    boundary = tuples(record["settings"]["boundary"])
     settings = replace(settings, **{**record["settings"], "boundary": boundary})
     for warning in record["warnings"]:
         progress.warn(warning)

@@ -34,7 +34,7 @@ def duration(seconds: float) -> str:
 
 
 class Progress:
-    """Print stages and warnings at once, and store them for the report.
+    """Print stages and warnings as they occur, and store them for the report.
 
     Attributes:
         start: the time from which elapsed times count.
@@ -76,8 +76,8 @@ class Progress:
     def update(self, text: str) -> None:
         """Show the progress of the current stage, in place on a terminal or otherwise every few seconds.
 
-        If the text has an estimate of the remaining time (`hks_jax.eigen.solver.Status`), it is shown with the estimate
-        and with a bar of the elapsed fraction.
+        If the text has an estimate of the remaining time (`hks_jax.eigen.solver.Status`), the estimate and a bar of the
+        elapsed fraction are shown with it.
         """
         now, left = time.perf_counter(), getattr(text, "seconds_left", None)
         with self._lock:
@@ -177,7 +177,7 @@ class StudyProgress(Progress):
             self._subject = ""
 
     def line(self) -> str:
-        """Return the bar, the numbers of finished and all subjects, and after the first one the remaining time."""
+        """Return the bar, the numbers of finished and all subjects, and after the first subject the remaining time."""
         text = f"{bar(self.ended / max(1, self.total))} {self.ended} of {self.total}"
         if not self.ended or self.ended == self.total:
             return text
@@ -186,7 +186,7 @@ class StudyProgress(Progress):
         return f"{text}, about {duration(max(left, 0.0))} left"
 
     def note(self, text: str) -> None:
-        """Print nothing, because the sidecar of a subject contains the notes of the reader."""
+        """Print nothing, because the sidecar of a subject contains all notes."""
 
     def end(self, text: str) -> None:
         """Print the result of a subject or of the study."""

@@ -3,7 +3,6 @@
 import argparse
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -17,14 +16,9 @@ from hks_jax.io.repair import find_background, require_valid, without_background
 from hks_jax.io.units import unit_question
 
 
-def image_suffix(path: Path) -> str:
-    """Return the suffix of images in the format of a file; it is empty for NumPy's files."""
-    return format_of(path).image
-
-
 def require_metric(args: argparse.Namespace) -> None:
     """Raise ValueError if the file has diffusion tensors and no metric is chosen."""
-    if args.metric is None and image_suffix(args.file):
+    if args.metric is None and format_of(args.file).image:
         raise ValueError(
             "--metric: choose the metric of the diffusion tensors D: inverse (D⁻¹, for Brownian motion with "
             "diffusivity D), tensor (D itself) or adjugate (|D|D⁻¹)"
@@ -44,13 +38,14 @@ def read_volume(args: argparse.Namespace, progress: Progress) -> TensorVolume:
 def read(args: argparse.Namespace, progress: Progress, ask: Callable[[str], None] | None = None) -> TensorVolume:
     """Read or fit the tensors, and apply the options for the slice, the mask and the repair.
 
-    Questions go to `ask` or become warnings. With ``args.strict_unit``, an implausible unit without ``--unit`` fails.
+    Questions about the frame or unit go to `ask` or become warnings. With ``args.strict_unit``, an implausible mean
+    diffusivity without ``--unit`` raises ValueError.
     """
     with progress.stage("reading", str(args.file)):
         volume, mask = _load(args)
         if mask is not None and mask.shape == volume.shape:
             volume, mask = volume.with_mask(mask), None
-        if mask is None:  # the background would distort the checks of units and axes
+        if mask is None:  # the background would distort the checks of units and frames
             volume = _without_filling(without_background(volume), args.background, progress)
         volume = _reviewed(volume, args, progress.warn if ask is None else ask)
         if args.slice is not None:
@@ -76,7 +71,7 @@ def read(args: argparse.Namespace, progress: Progress, ask: Callable[[str], None
 
 
 def sliced(volume: TensorVolume, axis: str, index: int) -> TensorVolume:
-    """Return a slice; an error names the option ``--slice``."""
+    """Return a slice of a volume; errors begin with the option ``--slice``."""
     try:
         return volume.slice(axis, index)
     except ValueError as error:
@@ -84,7 +79,7 @@ def sliced(volume: TensorVolume, axis: str, index: int) -> TensorVolume:
 
 
 def _load(args: argparse.Namespace) -> tuple[TensorVolume, np.ndarray | None]:
-    """Return the volume, and the mask of ``--mask`` if the volume does not have it yet."""
+    """Return the volume, and the mask of ``--mask`` unless it is the mask of the volume already."""
     if args.bval is None and args.bvec is None:
         refuse(args, ("b_max",), "this option is for diffusion-weighted images; pass --bval and --bvec too")
         refuse(args, ("bvec_frame",), "this option is for diffusion-weighted images; for tensors pass --frame")
@@ -118,7 +113,7 @@ def _without_filling(volume: TensorVolume, background: str | None, progress: Pro
 
 def _reviewed(volume: TensorVolume, args: argparse.Namespace, ask: Callable[[str], None]) -> TensorVolume:
     """Ask questions about a wrong frame or unit; return the volume with a note about its fibres."""
-    if args.positive is not None:  # these are not diffusion tensors
+    if args.positive is not None:  # the tensors, such as stresses, are not diffusion tensors
         return volume
     volume, asked = reviewed(volume)
     for question in asked:

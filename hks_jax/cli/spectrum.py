@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from hks_jax.cli.job import Settings, compute_pairs, describe_pairs
+from hks_jax.cli.job import Settings, compute_pairs, describe_input, describe_pairs
 from hks_jax.cli.options import READING, SOLVING
 from hks_jax.cli.outputs import Done, writing
 from hks_jax.cli.progress import Progress
@@ -44,7 +44,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     }
     left_out = ("times", "normalisation", "method")
     report = {
-        "input": solved.described,
+        "input": describe_input(solved.volume),
         "settings": {name: value for name, value in asdict(solved.settings).items() if name not in left_out}
         | {"k": pairs.k},
         "eigenpairs": describe_pairs(pairs),

@@ -56,7 +56,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
 
 
 def names_of(labels: Path, names: Path | None) -> tuple[Path | None, dict[int, str]]:
-    """Return the names of labels and their file, which is `names` or the table beside the labels."""
+    """Return the file with the names of labels (`names`, or the table beside the labels), and the names."""
     beside = names or names_beside(labels)
     return (None, {}) if beside is None else (Path(beside), read_names(beside))
 
@@ -79,7 +79,7 @@ def region_table(
     if not regions.nodes.any():
         raise ValueError(f"{atlas}: none of the {regions.labels.size} regions has a voxel in the domain of {source}")
     n_times, n_regions = regions.mean.shape
-    by_time = {"t": result.times, "lambda1_t": result.arrays.get("scaled_times")}  # for --time-unit lambda1
+    by_time = {"t": result.times, "lambda1_t": result.arrays.get("scaled_times")}  # present for --time-unit lambda1
     by_region = {
         "index": regions.labels,
         "voxels": regions.nodes,
@@ -90,7 +90,7 @@ def region_table(
     cells = {name: np.tile(of, n_regions) for name, of in by_time.items() if of is not None}
     cells |= {name: np.repeat(of, n_times) for name, of in by_region.items()}
     cells |= {"mean": regions.mean.T.ravel(), "std": regions.deviation.T.ravel(), "median": regions.median.T.ravel()}
-    if "noise_maps" in result.arrays:  # the variance of the mean is that of means of noise
+    if "noise_maps" in result.arrays:  # the error of a regional mean comes from means of noisy maps
         draws = [region_statistics(one, labels).mean for one in result.arrays["noise_maps"]]
         cells["error"] = np.sqrt(np.mean(np.square(draws), axis=0)).T.ravel()
     about = {name: of for name, of in _about(result, atlas, names).items() if name in cells or name[0].isupper()}

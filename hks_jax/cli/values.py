@@ -16,7 +16,7 @@ from hks_jax.io.repair import REPAIRS
 
 
 def _reader(expected: str, read: Callable[[str], Any]) -> Callable[[str], Any]:
-    """Return a parser of texts that raises an error with the expected form if `read` returns None."""
+    """Return a parser of texts that raises an error, which states what is `expected`, if `read` returns None."""
 
     def parse(text: str) -> Any:
         if (value := read(text)) is None:
@@ -81,15 +81,10 @@ def parse_folder(text: str) -> Path:
     return Path(text)
 
 
-def parse_target(text: str) -> Path:
-    """Return the path of a file if its folder is writable or can be created."""
-    return parse_folder(os.path.dirname(text) or ".") / os.path.basename(text)
-
-
 KINDS: dict[str, Callable[[str], Any] | Iterable[str]] = {
     **dict.fromkeys(("FILE", "RESULT", "SUBJECTS", "TARGET"), Path),
     **dict.fromkeys(("OUT", "DIR"), parse_folder),
-    **dict.fromkeys(("TABLE", "PAGE", "PICTURE"), parse_target),
+    **dict.fromkeys(("TABLE", "PAGE", "PICTURE"), lambda text: parse_folder(str(Path(text).parent)) / Path(text).name),
     **dict.fromkeys(("N", "K"), int),
     **dict.fromkeys(("H", "C", "B", "DPI", "SIGMA", "LENGTH"), float),
     "AXIS=N": _reader(

@@ -49,15 +49,15 @@ def hks_expansion(
 
         u₁ = R/6,   u₂ = (R² + 2|Ric|² + 4∇²R)/120.
 
-    These are the coefficients of McKean and Singer (1967), u₂ = (5R² − 2|Ric|² + 2|Riem|² + 12∇²R)/360, by
-    |Riem|² = 4|Ric|² − R². It ignores the boundary, and holds at distances well above 3√t from it.
+    These are the coefficients of McKean and Singer (1967), u₂ = (5R² − 2|Ric|² + 2|Riem|² + 12∇²R)/360, with |Riem|² =
+    4|Ric|² − R². The expansion ignores the boundary, and holds at distances well above 3√t from it.
 
-    If the field was made from a function, the coefficients are exact, from JAX derivatives. Otherwise they are from
-    finite differences of sixth order, which are one-sided near the sides of a grid and the rim of a mask. There u₂ is
-    of fourth order and u₃ of second order in the spacing h, measured as a length. For the machine precision ε, the
-    relative rounding error of u₃ is about ε(t/h²)³/5, and a hundred times larger within eight nodes of a side or rim.
-    In float32 keep t below 30 h², or the order below 3. The result is NaN outside the mask, and where no stencil fits
-    into it.
+    If the field was made from a function, the coefficients are exact, from JAX derivatives. Otherwise the coefficients
+    come from finite differences of sixth order, which are one-sided near the sides of a grid and the rim of a mask.
+    Near sides and rims, u₂ is of fourth order and u₃ of second order in the spacing h, measured as a length. For the
+    machine precision ε, the relative rounding error of u₃ is about ε(t/h²)³/5, and a hundred times larger within eight
+    nodes of a side or rim. In float32 keep t below 30 h², or the order below 3. The result is NaN outside the mask, and
+    where no stencil fits into the mask.
 
     Args:
         field: the metric, d = 2 or 3.

@@ -29,8 +29,8 @@ from hks_jax.domain.tensor_field import TensorField
 def scalar_curvature(field: TensorField, periodic: bool | Sequence[bool] = False) -> Float[Array, "*shape"]:
     """Return the scalar curvature R of a metric at the nodes; on a surface R = 2K for the Gaussian curvature K.
 
-    If the field was made from a function, R is exact, from JAX derivatives. Otherwise it is from finite differences of
-    sixth order of the nodal tensors, and NaN as in `gaussian_curvature`.
+    If the field was made from a function, R is exact, from JAX derivatives. Otherwise R comes from finite differences
+    of sixth order of the nodal tensors, and is NaN as in `gaussian_curvature`.
 
     Args:
         field: the metric, d = 2 or 3.
@@ -50,16 +50,15 @@ def scalar_curvature(field: TensorField, periodic: bool | Sequence[bool] = False
 def gaussian_curvature(field: TensorField, periodic: bool | Sequence[bool] = False) -> Float[Array, "*shape"]:
     """Return the Gaussian curvature K of a two-dimensional metric at the nodes.
 
-    If the field was made from a function, K is exact, from JAX derivatives. Otherwise it is from finite differences of
-    sixth order of the nodal tensors, which are one-sided near the edges of the grid and the mask. K is NaN outside the
-    mask, and where no stencil of 7 nodes along a grid line fits into it (8 for a second derivative near an edge).
+    If the field was made from a function, K is exact, from JAX derivatives. Otherwise K comes from finite differences
+    of sixth order of the nodal tensors, which are one-sided near the edges of the grid and the mask. K is NaN outside
+    the mask, and where no stencil of 7 nodes along a grid line fits into it (8 for second derivatives near an edge).
 
     Args:
         periodic: whether the axes are periodic (node n is node 0), one value for all or one per axis.
 
     Raises:
-        ValueError: a field that is not two-dimensional; fewer than 8 nodes along an axis of a nodal field; a bad
-            `periodic`.
+        ValueError: a field that is not 2D; fewer than 8 nodes along an axis of a nodal field; a bad `periodic`.
 
     Examples:
         >>> K = hj.gaussian_curvature(hj.examples.sphere_field(9))
@@ -114,8 +113,8 @@ def riemann(metric: Jet) -> Float[Array, "... p p"]:
 def einstein(metric: Jet) -> Float[Array, "... 3 3"]:
     """Return the Einstein tensor (Ric − ½Rg)ⁱʲ of a three-dimensional metric.
 
-    It is the double dual of the curvature tensor, and so determines it in three dimensions: component ij is
-    −R_abcd/|g|, where the planes ab and cd are perpendicular to the axes i and j.
+    The Einstein tensor is the double dual of the curvature tensor, which it determines in three dimensions: component
+    ij is −R_abcd/|g|, where the planes ab and cd are perpendicular to the axes i and j.
     """
     return -riemann(metric) / spd.determinant(metric.value)[..., None, None]
 
@@ -150,7 +149,7 @@ def laplace_beltrami(
 ) -> Float[Array, "*shape"]:
     """Return ∇²f = div grad f = (1/√g) ∂ₐ(√g gᵃᵇ ∂ᵦf) at the nodes, negative at a peak of f (geometers' −Δf).
 
-    Derivatives of functions, be it the metric or `f`, are exact. Derivatives of nodal values are finite differences of
+    If the metric or `f` is a function, its derivatives are exact. Derivatives of nodal values are finite differences of
     sixth order, and NaN as in `gaussian_curvature`.
 
     Args:

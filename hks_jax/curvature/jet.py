@@ -34,7 +34,7 @@ def stencils(order: int) -> tuple[np.ndarray, np.ndarray]:
     weights = np.zeros((len(runs), MINIMUM_NODES))
     for row, run in enumerate(runs):
         for column, node in enumerate(run):
-            # The derivative at 0 of the Lagrange polynomial of this node; products of small integers are exact.
+            # The weight is the derivative at 0 of the node's Lagrange polynomial; products of small integers are exact.
             others = run[run != node]
             offsets[row, column] = node
             weights[row, column] = factorial(order) * np.poly(others)[-1 - order] / np.prod(node - others)
@@ -49,9 +49,9 @@ def differentiate(
     spacing: float,
     wraps: bool,
 ) -> tuple[Float[Array, "*shape_and_components"], Bool[np.ndarray, "*shape"]]:
-    """Return the first or second derivative of nodal values along a grid axis, and the nodes where it is known.
+    """Return the first or second derivative of nodal values along a grid axis, and the nodes where this is known.
 
-    Only values at nodes inside are used. The derivative is 0 where no stencil consists of such nodes.
+    Only values at nodes inside the domain are used. The derivative is 0 where no stencil lies inside.
     """
     offsets, weights = stencils(order)
     n, d = inside.shape[axis], inside.ndim
@@ -67,14 +67,14 @@ def differentiate(
         index = (nodes + shifts[rows, column]) % n
         total += table[rows, column] * jnp.take_along_axis(values, index, axis=axis)
     valid = np.broadcast_to(valid, inside.shape)
-    # Unknown derivatives are zero and not NaN, since 0·NaN would spoil the gradient of known ones.
+    # Unknown derivatives are zero and not NaN, since 0·NaN would spoil the gradient of known derivatives.
     return jnp.where(np.expand_dims(valid, expand), total, 0), valid
 
 
 def _choose(
     inside: np.ndarray, offsets: np.ndarray, axis: int, wraps: bool
 ) -> tuple[np.ndarray, Bool[np.ndarray, "*shape"]]:
-    """Return for each node the first stencil with all nodes inside (0 if there is none), and whether there is one."""
+    """Return for each node the first stencil with all nodes inside (0 if none fits), and whether a stencil fits."""
     reach = MINIMUM_NODES - 1
     width = [(reach, reach) if a == axis else (0, 0) for a in range(inside.ndim)]
     padded = np.pad(inside, width, mode="wrap") if wraps else np.pad(inside, width)
@@ -155,7 +155,7 @@ def inner(inverse: Float[Array, "... d d"], p: Float[Array, "... d"], q: Float[A
 
 
 def metric_function(field: TensorField) -> Callable[[Array], Array]:
-    """Return the field's function, symmetrised, in the dtype of its argument; NaN if it is not positive definite."""
+    """Return the field's function with symmetric values in the dtype of its argument; NaN if not positive definite."""
     function = field.function
     assert function is not None
     return lambda x: spd.positive_or_nan(spd.symmetrise(jnp.asarray(function(x), x.dtype)))
@@ -178,7 +178,7 @@ def domain_nodes(grid: Grid, wraps: tuple[bool, ...]) -> Bool[np.ndarray, "*shap
 def at_nodes(fn: Callable[[Array], Any], grid: Grid, inside: Bool[np.ndarray, "*shape"]) -> Any:
     """Evaluate a function of position at every node; arrays in the result have the shape (*shape, …) of the grid.
 
-    Nodes outside the domain get the value at a node inside. The function may be undefined outside, and a NaN there
+    Nodes outside the domain get the value at a node inside. The function may be undefined outside the domain, and NaN
     would spoil gradients even if it is masked afterwards.
     """
     flat = np.where(inside[..., None], grid.nodes, grid.nodes[inside][0]).reshape(-1, grid.dimension)

@@ -20,8 +20,9 @@ Series = Float[Array, " _n_terms"]
 def expand(fn: Callable[[Array], Array], x: Float[Array, " 2"], degree: int) -> Float[Array, "*components n_terms"]:
     """Return the Taylor series of a function at a point, exact to rounding.
 
-    Derivatives along a line are those of a function of one variable, and cheap. Those in degree + 1 directions
-    determine mixed derivatives: Dᵏf along (c, s) is k! Σⱼ cᵏ⁻ʲ sʲ fₖⱼ. For equidistant angles this is well-conditioned.
+    Derivatives along a line are cheap, because only one variable changes. The derivatives along degree + 1 lines
+    determine the mixed derivatives: Dᵏf along (c, s) is k! Σⱼ cᵏ⁻ʲ sʲ fₖⱼ. For equidistant angles this is
+    well-conditioned.
     """
     angles = np.pi * np.arange(degree + 1) / (degree + 1)
     c, s = np.cos(angles)[:, None], np.sin(angles)[:, None]
@@ -78,7 +79,7 @@ def reciprocal(a: Series) -> Series:
 
 
 def derivative(a: Series, axis: int) -> Series:
-    """Return the derivative with respect to a variable, which is one degree shorter."""
+    """Return the derivative with respect to a variable, a series of one degree less."""
     exponents = _exponents(a.size)[:, axis]
     kept = np.flatnonzero(exponents)
     return a[kept] * jnp.asarray(exponents[kept], a.dtype)

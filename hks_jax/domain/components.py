@@ -13,7 +13,7 @@ from hks_jax.checks import require_real
 
 
 def as_mask(name: str, values: Any) -> Bool[np.ndarray, "*shape"]:
-    """Return zeros and ones as booleans; raise ValueError for anything else."""
+    """Return a mask of zeros and ones as booleans; raise ValueError for other values."""
     array = np.asarray(values)
     require_real(name, array)
     if array.dtype != bool and not np.isin(array, (0, 1)).all():
@@ -30,7 +30,7 @@ def wrap_nodes(nodes: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
 
 
 def _corners(dimension: int) -> list[tuple[slice, ...]]:
-    """Return for each corner of elements the slices that select the nodes there from `wrap_nodes`."""
+    """Return the slices that select the nodes at each corner of all elements from the result of `wrap_nodes`."""
     return list(product(*[(slice(None, -1), slice(1, None))] * dimension))
 
 
@@ -41,7 +41,7 @@ def active_elements(mask: Bool[np.ndarray, "*shape"], periodic: tuple[bool, ...]
 
 
 def element_nodes(elements: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
-    """Mark the nodes of marked elements; if elements have numbers, return the greatest number around each node."""
+    """Mark the nodes of marked elements; for numbered elements, return the greatest number around each node."""
     nodes = np.zeros([n + 1 for n in elements.shape], elements.dtype)
     for corner in _corners(elements.ndim):
         np.maximum(nodes[corner], elements, out=nodes[corner])
@@ -65,7 +65,7 @@ def label_nodes(mask: Bool[np.ndarray, "*shape"], periodic: tuple[bool, ...]) ->
     """
     elements = active_elements(mask, periodic)
     # Elements that share a node are connected, whereas two neighbouring nodes need not share an element. So elements
-    # are labelled first, and nodes take their labels. Elements are also connected by a node on a periodic side.
+    # are labelled first, and nodes take the labels of their elements. Nodes on periodic sides connect elements, too.
     labels, count = scipy.ndimage.label(elements, structure=np.ones((3,) * mask.ndim, dtype=bool))
     nodes = element_nodes(labels, periodic)
     if any(periodic) and count > 1:

@@ -36,14 +36,14 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
 
     Args:
         field: a 2D field. Cells with a node outside the mask are not part of the domain.
-        merge: zeros in cells that are at most `merge` cells apart along either axis count as one point. It is at least
-            1, because a zero on an edge belongs to two cells.
+        merge: zeros in cells that are at most `merge` cells apart along either axis count as one point. The least value
+            is 1, because a zero on an edge belongs to two cells.
 
     Returns:
         The points, sorted by the first and then by the second coordinate.
 
     Raises:
-        ValueError: a 3D field; merge less than 1.
+        ValueError: if the field is 3D, or if `merge` is less than 1.
 
     Examples:
         >>> hj.degenerate_points(hj.examples.degenerate_point_field(0.5, 9))
@@ -61,7 +61,7 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
     tensors = nodal.astype(np.float64)
     v = np.stack([tensors[..., 0, 0] - tensors[..., 1, 1], 2 * tensors[..., 0, 1]], axis=-1)
     active = active_elements(grid.inside, (False, False))
-    # Vectors that are at most this long are zero up to rounding.
+    # A vector is zero up to rounding if its length is at most this value.
     tiny = 16 * np.finfo(nodal.dtype).eps * np.trace(tensors, axis1=-2, axis2=-1)
     winding, crossed, on_rim = _windings(v, tiny, active)
     cells = np.argwhere(active & ((winding != 0) | crossed))
@@ -72,7 +72,7 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
     graph = coo_matrix((np.ones(len(near)), near.T), shape=(len(cells),) * 2)
     count, cluster = connected_components(graph, directed=False)
     turns = winding[tuple(cells.T)]
-    # Several cells share a zero on an edge or node. The turns in each are arbitrary, but their sum is not.
+    # Several cells share a zero on an edge or node. The turns in each cell are arbitrary, but their sum is not.
     index = np.bincount(cluster, turns, count) / 2
     settled = np.bincount(cluster, on_rim[tuple(cells.T)], count) == 0
     shared = crossed[tuple(cells.T)]
@@ -89,7 +89,7 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
 def _windings(
     v: Float[np.ndarray, "nx ny 2"], tiny: Float[np.ndarray, "nx ny"], active: Bool[np.ndarray, "mx my"]
 ) -> tuple[Int[np.ndarray, "mx my"], Bool[np.ndarray, "mx my"], Bool[np.ndarray, "mx my"]]:
-    """Return the turns of v around each cell, the cells with a zero on an edge, and those with a zero on the rim."""
+    """Return the turns of v around each cell; mark the cells with a zero on an edge, and with a zero on the rim."""
     angle = np.arctan2(v[..., 1], v[..., 0])
     zero = np.hypot(v[..., 0], v[..., 1]) <= tiny
     number = np.zeros(active.shape)
@@ -123,7 +123,7 @@ def _ends(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _zeros_in_cells(v: Float[np.ndarray, "nx ny 2"], cells: Int[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """Return the zero of the bilinear interpolant in each cell, in units of its sides; the centre if there is none.
+    """Return the zero of the bilinear interpolant in each cell, in units of the cell's sides, or else its centre.
 
     Eliminating x from both components of a₀ + a₁x + a₂y + a₃xy = 0 gives a quadratic equation in y.
     """

@@ -1,4 +1,4 @@
-"""The paper's fields, and charts of surfaces whose geometry is known in closed form.
+"""The fields of Zobel, Reininghaus and Hotz (the paper), and charts of surfaces with a geometry in closed form.
 
 All fields are made from functions, so that their curvature is exact. Angles are in radians.
 """
@@ -39,7 +39,7 @@ def pullback(parametrisation: Callable[[Point], Float[Array, " m"]]) -> Metric:
 
 
 def torus(x: Float[Array, " 2"], major: float | Array, minor: float | Array) -> Float[Array, " 3"]:
-    """Return the point of a torus of revolution; x₁ is the angle about the axis, x₂ the angle about the tube.
+    """Return the point of a torus of revolution; x₁ is the angle around its axis, x₂ the angle around its tube.
 
     Examples:
         >>> print(hj.examples.torus(jnp.zeros(2), 2.0, 1.0))
@@ -62,7 +62,7 @@ def bumpy_torus(x: Float[Array, " 2"]) -> Float[Array, " 3"]:
 def torus_field(shape: Sequence[int], major: float = 2.0, minor: float = 1.0) -> TensorField:
     """Return the metric of a torus of revolution on its periodic chart (0, 2π)²; both axes are ``"periodic"``.
 
-    Its Gaussian curvature is cos x₂ / (minor (major + minor cos x₂)).
+    The Gaussian curvature is cos x₂ / (minor (major + minor cos x₂)).
 
     Examples:
         >>> print(hj.examples.torus_field((9, 9)).tensors[0, 0].diagonal().round(3))  # of the outer equator
@@ -117,7 +117,8 @@ def ball_mesh(n: int) -> TetMesh:
     vertices. Dihedral angles are between 36° and 130°.
 
     Let jₗ be the spherical Bessel functions. With Dirichlet conditions the eigenvalues of the ball are the squares of
-    the positive zeros of jₗ; with Neumann conditions they are 0 and those of jₗ'. Each has the multiplicity 2l + 1.
+    the positive zeros of jₗ; with Neumann conditions they are 0 and the squares of the positive zeros of jₗ'. Each
+    eigenvalue has the multiplicity 2l + 1.
 
     Examples:
         >>> mesh = hj.examples.ball_mesh(2)
@@ -139,7 +140,7 @@ def _stereographic(x: Float[Array, " 2"], sign: float) -> Float[Array, "2 2"]:
 def sphere_field(n: int, half_width: float = 3.0) -> TensorField:
     """Return the unit sphere (K = 1) in its stereographic chart, with n × n nodes on (−half_width, half_width)².
 
-    The sides are at the distance 2 arctan(half_width) from the centre; a region around the other pole is missing.
+    The sides' midpoints are 2 arctan(half_width) away from the centre; a region around the other pole is missing.
 
     Examples:
         >>> print(hj.gaussian_curvature(hj.examples.sphere_field(9))[4, 4].round(3))
@@ -157,7 +158,7 @@ def hyperbolic_field(n: int, half_width: float = 0.6) -> TensorField:
         -1.0
     """
     if not 0 < half_width < 0.5**0.5:
-        raise ValueError(f"half_width: got {half_width}; expected more than 0 and less than 1/√2, to fit into the disk")
+        raise ValueError(f"half_width: got {half_width}; expected between 0 and 1/√2, to fit into the disk")
     grid = Grid.from_bounds(-half_width, half_width, (n, n))
     return TensorField.from_function(partial(_stereographic, sign=-1.0), grid)
 
@@ -190,7 +191,7 @@ def figure3_fields(n: int) -> dict[str, TensorField]:
 
 
 def rotated(angle: Callable[[Point], Array], major: float, minor: float) -> Metric:
-    """Return the metric with constant eigenvalues whose major eigenvector has the given angle to axis 0.
+    """Return the metric with these eigenvalues whose major eigenvector has the angle ``angle(u)`` to axis 0.
 
     Examples:
         >>> metric = hj.examples.rotated(lambda u: jnp.pi / 2 + 0 * u[0], major=4.0, minor=1.0)
@@ -209,8 +210,9 @@ def rotated(angle: Callable[[Point], Array], major: float, minor: float) -> Metr
 def figure4_fields(n: int, major: float = 4.0, minor: float = 1.0) -> dict[str, TensorField]:
     """Return fields of constant eigenvalues and analytic eigenvectors on n × n nodes of (0, 1)² (paper, Fig. 4).
 
-    All fields have the same constant trace, determinant and anisotropy; only the directions differ. The centre of the
-    circles and spirals is (−0.3, −0.3), outside the square. These and the straight field are flat, the others are not.
+    All fields have the same constant trace, determinant and anisotropy; only the eigenvectors differ. The centre of
+    ``"circles"`` and ``"spirals"`` is (−0.3, −0.3), outside the square. The fields ``"straight"``, ``"circles"`` and
+    ``"spirals"`` are flat; ``"waves"`` and ``"cells"`` are not.
 
     Examples:
         >>> waves = hj.examples.figure4_fields(9)["waves"]
@@ -236,9 +238,10 @@ def degenerate_point_field(index: float, n: int) -> TensorField:
     """Return a field with a degenerate point of the given index in the middle of n × n nodes of (−1, 1)² (Fig. 5).
 
     The eigenvalues are 10 ± 3|u|, and the major eigenvector has the angle ``index``·θ, where ``index`` is a multiple of
-    ½ and θ is the polar angle: T = 10·I + 3|u| [[c, s], [s, −c]] with c = cos(2·index·θ) and s = sin(2·index·θ). For
-    z = u₁ ± iu₂ with the sign of the index, and m = |2·index|, c + is = (z/|z|)ᵐ, which is computed without angles. For
-    the indices ±½ the field is smooth at the centre. For others it has no derivative there, so its curvature is NaN.
+    ½ and θ is the polar angle: T = 10·I + 3|u| [[c, s], [s, −c]] with c = cos(2·index·θ) and s = sin(2·index·θ). If z =
+    u₁ ± iu₂ with the sign of the index, and m = |2·index|, then c + is = (z/|z|)ᵐ, so no angle is computed. For the
+    indices ±½ the field is smooth at the centre. For other indices the field has no derivative at the centre, where the
+    curvature is NaN.
 
     Examples:
         >>> hj.degenerate_points(hj.examples.degenerate_point_field(-0.5, 9)).indices
@@ -275,11 +278,11 @@ def phantom(
 ) -> tuple[Float[np.ndarray, "*shape d d"], Bool[np.ndarray, "*shape"], tuple[float, ...]]:
     """Return diffusion tensors of a phantom that resembles an axial slice of a brain, or a stack of such slices.
 
-    It has a folded cortex of grey matter, and two ventricles. Its white matter has a corpus callosum, an arc of fibres
-    on each side, and crossings of both.
+    The phantom has a folded cortex of grey matter, and two ventricles. The white matter has a corpus callosum, an arc
+    of fibres on each side, and crossings of callosum and arcs.
 
     Args:
-        shape: the number of voxels along 2 axes (left–right and back–front) or 3 axes (and down–up).
+        shape: the number of voxels along 2 axes (left–right, back–front) or 3 axes (left–right, back–front, down–up).
 
     Returns:
         The tensors (*shape, d, d) in mm²/s, SPD everywhere; the mask (*shape); the spacing per axis in mm.

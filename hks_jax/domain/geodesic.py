@@ -19,8 +19,8 @@ def _icosahedron() -> tuple[Float[np.ndarray, "12 3"], Int[np.ndarray, "20 3"]]:
 
 
 # Kuhn's subdivision cuts each cube of a lattice into d! simplices. The vertices of a simplex form a path of unit steps,
-# one along each axis. The simplices with n ≥ x₁ ≥ … ≥ x_d ≥ 0 subdivide this large simplex into n^d cells. Large
-# simplices match at a common facet, because it is cut into triangles with edges parallel to its own.
+# one along each axis. The large simplex n ≥ x₁ ≥ … ≥ x_d ≥ 0 is the union of n^d of these simplices. Two large
+# simplices match at a common facet, because both cut it into triangles with edges parallel to the facet's edges.
 def _kuhn(n: int, dimension: int) -> tuple[Int[np.ndarray, "p corners"], Int[np.ndarray, "cells corners"]]:
     """Subdivide a simplex into n^d cells; return n times the barycentric coordinates of the points, and the cells."""
     lattice = np.indices((n + 1,) * dimension).reshape(dimension, -1).T
@@ -41,7 +41,7 @@ def _kuhn(n: int, dimension: int) -> tuple[Int[np.ndarray, "p corners"], Int[np.
 def _glued(
     simplices: Int[np.ndarray, "s corners"], n: int
 ) -> tuple[Int[np.ndarray, "V 13"], Int[np.ndarray, "cells corners"]]:
-    """Subdivide simplices on 13 vertices; return n times the barycentric coordinates of the points, and the cells."""
+    """Subdivide simplices on 12 corners and the centre; return n times the barycentric coordinates, and the cells."""
     weights, cells = _kuhn(n, simplices.shape[1] - 1)
     shares = np.zeros((len(simplices), len(weights), _CENTRE + 1), np.int16)
     for i, simplex in enumerate(simplices):
@@ -51,7 +51,7 @@ def _glued(
 
 
 def geodesic(n: int, dimension: int) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "cells corners"]]:
-    """Return the points and cells of the unit sphere (2; triangles oriented outward) or ball (3; tetrahedra).
+    """Return the points and cells of the unit sphere (dimension 2, triangles oriented outward) or ball (3, tetrahedra).
 
     The sphere has 10n² + 2 points and 20n² triangles. The ball has n layers about its centre, with 20n³ tetrahedra.
     """
@@ -61,6 +61,6 @@ def geodesic(n: int, dimension: int) -> tuple[Float[np.ndarray, "V 3"], Int[np.n
     length, radius = np.linalg.norm(vertices, axis=1), 1 - shares[:, _CENTRE] / n
     vertices *= (radius / np.where(length > 0, length, 1))[:, None]
     frames = vertices[cells] if dimension == 2 else vertices[cells[:, 1:]] - vertices[cells[:, :1]]
-    # If the frame of a cell is left-handed, two of its vertices are swapped.
+    # A cell with a negative determinant is inverted, so two of its vertices are swapped.
     left = np.linalg.det(frames) < 0
     return vertices, np.where(left[:, None], cells[:, [1, 0, *range(2, dimension + 1)]], cells)

@@ -22,11 +22,11 @@ class Grid(ByKey):
     A grid is static and hashable: it has no leaves, and `jax.jit`, `jax.grad` and `jax.vmap` treat it as structure.
 
     Args:
-        shape: the number of nodes along each of 2 or 3 axes, at least 2.
+        shape: the number of nodes along each of 2 or 3 axes, at least 2 per axis.
         spacing: the distance between nodes along each axis (or one number for all axes), in coordinate units.
         origin: the coordinates of node (0, …, 0).
         mask: bool array of `shape`, True inside. The domain is the union of the elements with all nodes inside; results
-            are NaN at all other nodes. None: the whole grid.
+            are NaN at nodes that belong to none of these elements. None: the whole grid.
         components: the treatment of a mask with several connected components: ``"raise"`` (default) raises an error
             with their number, ``"largest"`` keeps the one with the most nodes, ``"all"`` keeps all.
 
@@ -100,7 +100,7 @@ class Grid(ByKey):
 
     @property
     def inside(self) -> np.ndarray:
-        """The mask as bool (*shape), True everywhere if there is none."""
+        """The mask as bool (*shape); True everywhere if the grid has no mask."""
         return np.ones(self.shape, dtype=bool) if self._mask is None else self._mask.value
 
     @property
@@ -120,7 +120,7 @@ class Grid(ByKey):
 
     @cached_property
     def unit(self) -> "Grid":
-        """The grid of the same nodes with spacing 1 and origin 0, which determines the structure of matrices."""
+        """The grid of this shape and mask with spacing 1 and origin 0, which determines sparsity patterns."""
         unit = Grid(self.shape)
         unit._mask = self._mask
         return unit
@@ -138,20 +138,22 @@ def _checked_shape(shape: Sequence[int]) -> tuple[int, ...]:
     try:
         return tuple(operator.index(n) for n in shape)
     except TypeError:
-        raise ValueError(f"shape: got {shape!r}; expected a tuple of 2 or 3 integers, the nodes per axis") from None
+        raise ValueError(
+            f"shape: got {shape!r}; expected a tuple of 2 or 3 integers, the node counts per axis"
+        ) from None
 
 
 def per_axis(name: str, value: float | Sequence[float] | np.ndarray, dimension: int) -> tuple[float, ...]:
-    """Return a finite number for each axis, from such numbers or one number for all axes."""
+    """Return one finite number per axis; a single given number is used for all axes."""
     require_real(name, value)
     try:
         values = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"{name}: got {value!r}; expected {dimension} numbers, one per axis of shape") from None
+        raise ValueError(f"{name}: got {value!r}; expected {dimension} numbers, one per axis") from None
     if values.ndim == 0:
         values = np.full(dimension, values)
     if values.shape != (dimension,) or not np.isfinite(values).all():
-        raise ValueError(f"{name}: got {value}; expected {dimension} finite numbers, one per axis of shape")
+        raise ValueError(f"{name}: got {value}; expected {dimension} finite numbers, one per axis")
     return tuple(values.tolist())
 
 
@@ -173,7 +175,7 @@ def _checked_mask(mask: Any, shape: tuple[int, ...], components: str) -> np.ndar
         if components == "raise":
             largest = ", ".join(str(n) for n in np.sort(sizes)[::-1][:5]) + (", …" if count > 5 else "")
             raise ValueError(
-                f"mask: got {count} connected components ({largest} nodes); expected one. "
+                f"mask: got {count} connected components ({largest} nodes); expected one component. "
                 'Pass components="largest" to keep the largest one, or components="all" to keep all'
             )
         array = labels == 1 + int(np.argmax(sizes))

@@ -1,4 +1,4 @@
-"""Checks of triangles and tetrahedra in space, which are given as arrays."""
+"""Checks of the arrays that describe triangles or tetrahedra in space."""
 
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -12,9 +12,9 @@ from hks_jax.domain.components import as_mask
 from hks_jax.domain.triangulation import Triangulation
 
 _FLAT = 1e-10
-"""A simplex is degenerate up to this area (volume), relative to the square (cube) over its longest edge."""
+"""A simplex is degenerate if d! times its volume, relative to the d-th power of its longest edge, is at most this."""
 _ON_EDGE = 1e-6
-"""A vertex is on an edge up to this distance from the edge, relative to the edge's length."""
+"""A vertex is on an edge if its distance from the edge is at most this fraction of the edge's length."""
 
 
 class Words(NamedTuple):
@@ -65,7 +65,7 @@ def checked_mask(
     """Return the simplices inside a mask of simplices, or the simplices with all vertices inside a mask of vertices.
 
     Raises:
-        ValueError: another shape; values other than 0 and 1; a mask that may be either; a mask without a simplex.
+        ValueError: another shape; values other than 0 and 1; an ambiguous mask; a mask without a simplex.
     """
     words, inside = WORDS[dimension], np.asarray(mask)
     if inside.shape not in ((n_vertices,), (len(cells),)):
@@ -81,7 +81,8 @@ def checked_mask(
             f"ambiguous; to mask {words.argument}, pass {words.argument}[mask] and a mask that is True everywhere"
         )
     if not kept.any():
-        raise ValueError(f"mask: {int(inside.sum())} of {inside.size} vertices are inside, but no {words.simplex}")
+        places = "vertices" if len(inside) == n_vertices else words.argument
+        raise ValueError(f"mask: {int(inside.sum())} of {inside.size} {places} are inside, but no {words.simplex} is")
     return kept
 
 
@@ -91,7 +92,7 @@ def signed_measure(
     """Return d! times the area or signed volume of each simplex, and whether it is nonzero beyond rounding."""
     corners = vertices[cells]
     edges = corners[:, 1:] - corners[:, :1]
-    with np.errstate(over="ignore", invalid="ignore"):  # areas of distant vertices may overflow
+    with np.errstate(over="ignore", invalid="ignore"):  # products of large coordinates may overflow
         normal = np.cross(edges[:, 0], edges[:, 1])
         measure = np.linalg.norm(normal, axis=1) if len(edges[0]) == 2 else np.sum(normal * edges[:, 2], axis=1)
         pairs = combinations(range(cells.shape[1]), 2)
@@ -125,7 +126,7 @@ def check_places(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulatio
             edge = triangulation.facet_vertices(crowded[:1])[0].tolist()
             warn_of_accuracy(
                 f"faces: {crowded.size} edges belong to three triangles or more (the first has the vertices {edge}): "
-                "the surface branches there, and heat flows into all branches. To avoid that, remove inner sheets"
+                "the surface branches there, and heat flows into all branches. To avoid this, remove the inner sheets"
             )
         _warn_of_hanging(vertices, triangulation)
         return
@@ -147,7 +148,7 @@ def check_places(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulatio
 
 
 def check_metric(metric: Float[np.ndarray, "n d d"], cells: Int[np.ndarray, "n corners"]) -> None:
-    """Raise ValueError if the metric of space on a simplex is NaN, because its height is lost to rounding."""
+    """Raise ValueError if the metric of space on a simplex is NaN, because rounding exceeds its height."""
     thin = np.isnan(metric).any(axis=(1, 2))
     if not thin.any():
         return
@@ -173,7 +174,7 @@ def _check_once(faces: Int[np.ndarray, "F 3"]) -> None:
 
 
 def _warn_of_hanging(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulation) -> None:
-    """Warn of boundary edges that pass through a vertex: the surface is torn where one side has more vertices."""
+    """Warn if boundary edges pass through a vertex. The surface is torn there, as one side has more vertices."""
     edges = triangulation.facet_vertices(triangulation.boundary_facets)
     rim = np.unique(edges)
     if not rim.size:

@@ -63,27 +63,28 @@ class SimplicialMesh(eqx.Module):
         interpolation: Interpolation = "linear",
         mask: Any = None,
     ) -> Mesh:
-        """Return the mesh with the metric of tensors D in the axes of space; a surface takes their tangential part.
+        """Return the mesh with a metric made of tensors D in space; a surface uses only their tangential parts.
 
         The tangential part is the quadratic form D on the plane of a triangle. For diffusion tensors it describes
         diffusion within the surface, with the diffusivities that were measured in it. The choice of the metric g has no
         default (see `TensorField.from_diffusion`): ``"tensor"``, g = D; ``"inverse"``, g = D⁻¹; ``"adjugate"``,
         g = |D| D⁻¹. On a surface D stands for its tangential part. If D is the identity, g is the metric of space.
 
-        With tensors at the vertices, a cell takes the mean of the tensors at its vertices, or with ``"log-euclidean"``
-        the exponential of the mean of their logarithms. This is the interpolant at the centre, with an error of second
-        order like that of the elements. The metric is differentiable with respect to tensors and vertices.
+        If the tensors are given at vertices, each cell takes the mean of the tensors at its vertices, or with
+        ``"log-euclidean"`` the exponential of the mean of their logarithms. The mean is the interpolant at the centre
+        of the cell. The error of this approximation is of second order, like the error of the elements. The metric is
+        differentiable with respect to tensors and vertices.
 
         Args:
             vertices: positions (V, 3).
             cells: vertex indices of the triangles (F, 3) or tetrahedra (C, 4).
-            tensors: one symmetric tensor per cell, (F, 3, 3) or (C, 3, 3), or per vertex, (V, 3, 3). They must be
-                positive definite in space, or on a surface in the planes of its triangles.
+            tensors: one symmetric tensor per cell, (F, 3, 3) or (C, 3, 3), or per vertex, (V, 3, 3). The tensors must
+                be positive definite; on a surface, only their tangential parts must be.
             metric: ``"inverse"``, ``"tensor"`` or ``"adjugate"``.
             at: whether the tensors belong to ``"faces"`` (of a surface), ``"cells"`` (of a solid) or ``"vertices"``;
                 needed only if there are as many cells as vertices.
             interpolation: ``"linear"`` or ``"log-euclidean"``, for tensors at vertices; see `TensorField`.
-            mask: the domain, see the class; tensors outside are ignored.
+            mask: the domain, as for the class; tensors outside are ignored.
 
         Raises:
             ValueError: an unknown metric or interpolation; wrong shapes; tensors that are NaN, infinite, unsymmetric or
@@ -100,7 +101,7 @@ class SimplicialMesh(eqx.Module):
         return f"{type(self).__name__}(vertices {describe_array(self.vertices)}, {cells}, metric {metric})"
 
     def restrict(self, of_cells: Any) -> Any:
-        """Return the entries for cells inside the mask, of an array (n, …) with an entry for every given cell."""
+        """Return the entries for the cells inside the mask, if the array (n, …) has entries for cells outside, too."""
         if self._mask is None or np.shape(of_cells)[:1] != self._mask.value.shape:
             return of_cells
         return (np.asarray(of_cells) if isinstance(of_cells, list | tuple) else of_cells)[self._mask.value]
@@ -120,16 +121,16 @@ class SimplicialMesh(eqx.Module):
 class SurfaceMesh(SimplicialMesh):
     """A triangle mesh in space, with the metric that space induces on it, or with a given metric.
 
-    It is a pytree: its leaves are the vertex positions and the given metric, if any. The connectivity is static.
+    A mesh is a pytree: its leaves are the vertex positions and the given metric, if any. The connectivity is static.
 
     Args:
         vertices: positions (V, 3).
         faces: vertex indices (F, 3).
-        metric: (F, 2, 2), the metric of each triangle in the basis of its edges v₁ − v₀ and v₂ − v₀, in place of the
-            induced metric.
-        mask: the domain as bool, True inside: (F,) for the triangles, or (V,) for the vertices, where a triangle is
-            inside if all of its vertices are. Triangles outside may be degenerate or NaN. The rim of the mask belongs
-            to the boundary, results are NaN at vertices outside, and ``faces`` has the triangles inside.
+        metric: (F, 2, 2), the metric of triangles in the basis of edges v₁ − v₀ and v₂ − v₀, in place of the induced
+            metric.
+        mask: bool, True inside the domain: (F,) for the triangles, or (V,) for the vertices. A triangle is inside if
+            all of its vertices are. Triangles outside may be degenerate or NaN. The rim of the mask belongs to the
+            boundary, results are NaN at vertices outside, and ``faces`` has only the triangles inside.
 
     Raises:
         ValueError: wrong shapes; a mask without triangles; indices out of range; vertices without a face; triangles
@@ -155,17 +156,17 @@ class SurfaceMesh(SimplicialMesh):
 class TetMesh(SimplicialMesh):
     """A mesh of tetrahedra, with the metric of space, or with a given metric that is constant on each tetrahedron.
 
-    It is a pytree: its leaves are the vertex positions and the given metric, if any. The connectivity is static.
+    A mesh is a pytree: its leaves are the vertex positions and the given metric, if any. The connectivity is static.
 
     Tetrahedra must be positively oriented, (v₁ − v₀) × (v₂ − v₀) · (v₃ − v₀) > 0, as in VTK and Gmsh. So an inverted
-    tetrahedron is an error, for example after moving a vertex. Under `jit` it gives NaN instead.
+    tetrahedron is an error, for example after moving a vertex. Under `jit` an inverted tetrahedron gives NaN instead.
 
     Args:
         vertices: positions (V, 3).
         cells: vertex indices (C, 4).
         metric: (C, 3, 3), the metric of each tetrahedron in the basis of its edges v₁ − v₀, v₂ − v₀ and v₃ − v₀, in
             place of the metric of space. For tensors in the axes of space see `from_tensors`.
-        mask: the domain as bool, (C,) for the tetrahedra or (V,) for the vertices, as for `SurfaceMesh`.
+        mask: bool, (C,) for the tetrahedra or (V,) for the vertices, as for `SurfaceMesh`.
 
     Raises:
         ValueError: wrong shapes; a mask without tetrahedra; indices out of range; vertices without a cell; NaN; a
@@ -189,11 +190,11 @@ class TetMesh(SimplicialMesh):
         return self.triangulation.cells
 
     def boundary(self) -> tuple[SurfaceMesh, Int[np.ndarray, " B"]]:
-        """Return the surface of the triangles that belong to one tetrahedron only, with the metric of space.
+        """Return the surface of the triangles that belong to only one tetrahedron, with the metric of space.
 
         Returns:
-            The surface, oriented outward, and the number in this mesh of each of its B vertices: values (…, V) on the
-            boundary are ``values[..., numbers]``.
+            The surface, oriented outward, and the indices (B,) of its vertices in this mesh. If they are ``numbers``,
+            values (…, V) on this mesh are ``values[..., numbers]`` on the surface.
         """
         triangulation = self.triangulation
         numbers, faces = np.unique(triangulation.facet_vertices(triangulation.boundary_facets), return_inverse=True)
@@ -235,7 +236,7 @@ def _tangential_metric(
     parts = matmul(across[:, None], symmetric[corners], frames[:, None])
     # The tensors at all vertices of a cell, and not only their mean, must be positive definite.
     parts = spd.nan_unless(xp, spd.is_positive(parts), parts)
-    # The logarithm is that of the tangential part, since tensors may be indefinite across a surface.
+    # The logarithm of the tangential part is used, because the tensor in space may be indefinite.
     mean = xp.mean(parts, axis=1) if interpolation == "linear" else spd.exp(jnp.mean(spd.log(parts), axis=1))
     coordinates = matmul(across, edges)
     return matmul(xp.swapaxes(coordinates, -1, -2), spd.metric_of_diffusion(mean, metric), coordinates)
@@ -255,12 +256,12 @@ def _induced_metric(xp: Any, edges: Any) -> Any:
 
 
 def oriented(xp: Any, frames: Any) -> Any:
-    """Return the frames ∂x/∂ξ (..., 3, d) of cells, with NaN in place of those of inverted tetrahedra."""
+    """Return the Jacobian matrices ∂x/∂ξ (..., 3, d) of cells, with NaN for inverted tetrahedra."""
     return frames if frames.shape[-1] == 2 else spd.nan_unless(xp, spd.determinant(frames) > 0, frames)
 
 
 def _orthonormal(xp: Any, edges: Any) -> Any:
-    """Return an orthonormal basis, as columns, of each triangle's plane by Gram–Schmidt, or of space."""
+    """Return an orthonormal basis, as columns, of the plane of each triangle (by Gram–Schmidt) or of space."""
     if edges.shape[-1] == 3:
         return xp.broadcast_to(xp.eye(3, dtype=edges.dtype), edges.shape)
     first, second = edges[..., 0], edges[..., 1]
@@ -301,7 +302,7 @@ def _check_tensors(
     if triangulation.dimension == 3:
         return require_spd("tensors", tensors, everywhere, place)
     require_finite_symmetric("tensors", tensors, everywhere, place)
-    # In orthonormal frames, the eigenvalues do not depend on the shape of the triangle.
+    # In an orthonormal basis the eigenvalues do not depend on the shape of the triangle.
     frames = np.linalg.qr(edges.astype(np.float64))[0]
     owners = triangulation.cells if at_vertices else np.arange(len(tensors))[:, None]
     parts = np.einsum("nxa,nixy,nyb->niab", frames, tensors[owners], frames)
@@ -313,5 +314,5 @@ def _check_tensors(
             f"tensors: {which.size} of {len(tensors)} tensors are not positive definite on "
             f"{'the faces around them' if at_vertices else 'their face'} (the first at {place} {which[0]}), "
             f"worst eigenvalue {least[bad].min():.3g}; expected tensors whose tangential part is "
-            "symmetric positive definite. Raise their eigenvalues, or check that their axes are those of the vertices"
+            "symmetric positive definite. Raise their eigenvalues, or check that tensors and vertices have one basis"
         )

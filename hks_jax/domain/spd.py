@@ -23,15 +23,13 @@ def symmetrise(xp: Any, tensors: Any) -> Any:
 def identity_outside(
     tensors: Float[Array, "*shape d d"], inside: Bool[np.ndarray | Array, "*shape"]
 ) -> Float[Array, "*shape d d"]:
-    """Return the tensors, with the identity in their place at nodes that are not inside."""
+    """Return the tensors, replaced by the identity at nodes outside the mask."""
     return tensors if isinstance(inside, np.ndarray) and inside.all() else _identity_outside(tensors, inside)
 
 
-@jax.jit
-def _identity_outside(
-    tensors: Float[Array, "*shape d d"], inside: Bool[np.ndarray | Array, "*shape"]
-) -> Float[Array, "*shape d d"]:
-    return jnp.where(inside[..., None, None], tensors, jnp.eye(tensors.shape[-1], dtype=tensors.dtype))
+@numpy_where_known()
+def _identity_outside(xp: Any, tensors: Any, inside: Any) -> Any:
+    return xp.where(inside[..., None, None], tensors, xp.eye(tensors.shape[-1], dtype=tensors.dtype))
 
 
 def adjugate(tensors: Any) -> Any:
@@ -64,16 +62,18 @@ def inverse(tensors: Any) -> Any:
 
 
 def metric_of_diffusion(tensors: Any, metric: str) -> Any:
-    """Return the metric of diffusion tensors D in JAX or NumPy: ``"inverse"``, ``"adjugate"``, or ``"tensor"``: D."""
+    """Return the metric ``"inverse"`` (D⁻¹), ``"adjugate"`` (|D| D⁻¹) or ``"tensor"`` (D) in JAX or NumPy."""
     return tensors if metric == "tensor" else inverse(tensors) if metric == "inverse" else adjugate(tensors)
 
 
 def cholesky(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
-    """Return the lower triangular L with T = LLᵀ; NaN for matrices that are not positive definite."""
-    d, factor = tensors.shape[-1], jnp.zeros_like(tensors)
-    for j in range(d):
+    """Return the lower triangular L with T = LLᵀ for positive semidefinite T. A column with the pivot zero is zero."""
+    factor = jnp.zeros_like(tensors)
+    for j in range(tensors.shape[-1]):
         column = tensors[..., j] - jnp.sum(factor * factor[..., j, None, :], axis=-1)
-        factor = factor.at[..., j:, j].set(column[..., j:] / jnp.sqrt(column[..., j, None]))
+        zero = (column[..., j] <= 1e-12 * tensors[..., j, j])[..., None]
+        column = column / jnp.sqrt(jnp.where(zero, 1, column[..., j, None]))
+        factor = factor.at[..., j:, j].set(jnp.where(zero, 0, column)[..., j:])
     return factor
 
 
@@ -92,20 +92,20 @@ def is_positive(t: Any) -> Any:
 
 @numpy_where_known()
 def positive_or_nan(xp: Any, tensors: Any) -> Any:
-    """Return the matrices, d = 2 or 3, with NaN in place of those that are not positive definite."""
+    """Return the matrices, d = 2 or 3, with NaN in place of matrices that are not positive definite."""
     return nan_unless(xp, is_positive(tensors), tensors)
 
 
-# A product and not `where(…)`, so that derivatives are NaN too.
+# A product with NaN, unlike `where(…)`, makes the derivatives NaN, too.
 def nan_unless(xp: Any, valid: Any, matrices: Any) -> Any:
-    """Return the matrices (..., i, j) of JAX or NumPy, with NaN in place of those that are not ``valid``."""
+    """Return the matrices (..., i, j) of JAX or NumPy, with NaN in place of matrices that are not ``valid``."""
     return matrices * xp.where(valid, 1, xp.nan).astype(matrices.dtype)[..., None, None]
 
 
 # If tr S = 0, the Cayley–Hamilton theorem gives S² = qI (d = 2) or S³ = pS + |S| I (d = 3). So exp S is a
 # polynomial in S of degree d − 1, whose coefficients are entire functions of q, or of p and |S|. No eigenvalues are
-# needed, and derivatives of any order are smooth where eigenvalues coincide. The coefficients are those of Taylor's
-# series at S/2ˢ, followed by s squarings of E = exp − I as 2E + E², which preserves the relative accuracy of E.
+# needed, and derivatives of any order are smooth where eigenvalues coincide. Taylor's series gives the coefficients of
+# E = exp(S/2ⁿ) − I. Each of n squarings replaces E by 2E + E², which preserves the relative accuracy of E.
 _SQUARINGS, _TERMS = 8, 20
 
 
@@ -186,8 +186,8 @@ def _log_by_eigenvalues(tensors: Float[Array, "... d d"]) -> Float[Array, "... d
     return _log_of_pairs(values, vectors)
 
 
-# The derivative of f(T) is V ([f]∘(Vᵀ dT V)) Vᵀ with the divided differences [f] of f (Daleckii and Krein 1965). They
-# are smooth where eigenvalues coincide, whereas the derivatives of eigenvectors are not.
+# The derivative of f(T) is V ([f]∘(Vᵀ dT V)) Vᵀ with the divided differences [f] of f (Daleckii and Krein 1965). The
+# divided differences are smooth where eigenvalues coincide, whereas the derivatives of eigenvectors are not.
 @_log_by_eigenvalues.defjvp
 def _log_by_eigenvalues_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     values, vectors = eigh(primals[0])

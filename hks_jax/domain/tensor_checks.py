@@ -53,9 +53,9 @@ def tensors_on(grid: Any, name: str, tensors: Any) -> Float[Array, "*shape d d"]
 def require_spd(
     name: str, tensors: Float[np.ndarray, "*shape d d"], inside: Bool[np.ndarray, "*shape"], place: str
 ) -> None:
-    """Raise ValueError unless the tensors are finite, symmetric and positive definite inside.
+    """Raise ValueError unless the tensors inside the mask are finite, symmetric and positive definite.
 
-    The place is the word for the location of a tensor: ``"node"`` for grids, which may have a mask, ``"vertex"``, …
+    `place` is the word for the location of a tensor in messages: ``"node"`` on grids, ``"vertex"``, …
     """
     require_finite_symmetric(name, tensors, inside, place)
     bad = inside & ~spd.is_spd(tensors)
@@ -73,7 +73,7 @@ def require_spd(
 def require_finite_symmetric(
     name: str, tensors: Float[np.ndarray, "*shape d d"], inside: Bool[np.ndarray, "*shape"], place: str
 ) -> None:
-    """Raise ValueError unless the tensors are finite and symmetric inside; see `require_spd`."""
+    """Raise ValueError unless the tensors inside the mask are finite and symmetric; see `require_spd`."""
     bad = inside & ~np.isfinite(tensors).all(axis=(-2, -1))
     if bad.any():
         refuse(name, bad, inside, place, "NaN or infinite", _MASK if place == "node" else "Replace them")
@@ -93,7 +93,7 @@ def unsymmetric(tensors: Float[np.ndarray, "*shape d d"]) -> Bool[np.ndarray, "*
 
 
 def least_eigenvalue(tensors: Float[np.ndarray, "n d d"]) -> float:
-    """Return the least eigenvalue of finite tensors, whose lower triangles are read."""
+    """Return the least eigenvalue of finite tensors; only their lower triangles are used."""
     return float(np.linalg.eigvalsh(tensors.astype(np.float64)).min())
 
 
@@ -109,7 +109,7 @@ def refuse(
 
 
 def right_cauchy_green(name: str, grid: Grid, F: Any) -> Float[Array, "*shape d d"]:
-    """Return C = FᵀF of gradients (*shape, m, d), m ≥ d; the identity outside the mask.
+    """Return C = FᵀF of deformation gradients F (*shape, m, d), m ≥ d, and the identity outside the mask.
 
     Raises:
         ValueError: a wrong shape; square gradients whose determinant is not positive.
@@ -132,8 +132,8 @@ def right_cauchy_green(name: str, grid: Grid, F: Any) -> Float[Array, "*shape d 
             first = tuple(int(i) for i in np.argwhere(bad)[0])
             raise ValueError(
                 f"{name}: {int(bad.sum())} of {int(grid.inside.sum())} gradients have a determinant that is not "
-                f"positive (the first at node {first}, {determinants[first]:.3g}); expected deformations that preserve "
-                f"orientation. Check that {name}[..., i, j] is ∂yᵢ/∂xⱼ, or exclude these nodes by the mask"
+                f"positive (the first is {determinants[first]:.3g} at node {first}); expected deformations that "
+                f"preserve orientation. Check that {name}[..., i, j] is ∂yᵢ/∂xⱼ, or exclude these nodes by the mask"
             )
     inside = grid.inside[..., None, None]
     safe = jnp.where(inside, gradients, jnp.eye(m, d, dtype=gradients.dtype))
@@ -143,13 +143,13 @@ def right_cauchy_green(name: str, grid: Grid, F: Any) -> Float[Array, "*shape d 
 PositiveMap = Literal["exp", "shift"]
 
 MAPS: dict[str, str] = {
-    "exp": "exp(S/s) with a stress s of your choice",
+    "exp": "exp(S/s) with a scale s of your choice",
     "shift": "S + c·I with c above minus the least eigenvalue",
 }
-"""The maps, with their descriptions in messages."""
+"""The description of each map in messages."""
 
 NUMBERS = {"exp": "scale", "shift": "shift"}
-"""The name of the number of each map."""
+"""What `number` means for each map."""
 
 
 def positive_map(
@@ -160,11 +160,10 @@ def positive_map(
     inside: Bool[np.ndarray, "*shape"],
     place: str = "node",
 ) -> Float[Array, "*shape d d"]:
-    """Return exp(S/s) or S + c·I of symmetric tensors S; outside, S is the identity.
+    """Return exp(S/s) or S + c·I of symmetric tensors S; outside the mask S is replaced by the identity.
 
     Raises:
-        ValueError: an unknown map; NaN, infinite or unsymmetric tensors; a number that is not a scale or shift, or for
-            which a mapped tensor is not positive definite.
+        ValueError: an unknown map; NaN, infinite or unsymmetric tensors; an invalid scale or shift; a singular result.
     """
     if how not in NUMBERS:
         choices = " or ".join(f'"{choice}" ({does})' for choice, does in MAPS.items())

@@ -31,8 +31,8 @@ from hks_jax.traced import is_traced
 class TensorField(eqx.Module):
     """A Riemannian metric given at the nodes of a grid.
 
-    It is a pytree: its leaves are the tensors, or the arrays in the metric's function. The grid is static. Under `jit`,
-    `grad` or `vmap` only shapes are checked, not values, and a tensor that is not positive definite gives NaN.
+    A field is a pytree: its leaves are the tensors, or the arrays in the metric's function. The grid is static. Under
+    `jit`, `grad` or `vmap` only shapes are checked, not values, and a tensor that is not positive definite gives NaN.
 
     Args:
         grid: the grid.
@@ -70,9 +70,8 @@ class TensorField(eqx.Module):
     ) -> "TensorField":
         """Return the metric ``fn``, which maps coordinates (d,) to a tensor (d, d) and is differentiable by JAX.
 
-        The field keeps the function, so that curvature and its derivatives are exact; `assemble` evaluates it at the
-        nodes, and interpolates between them. Parameters that should be traced belong in a `jax.tree_util.Partial` or an
-        Equinox module.
+        The field keeps the function, so that curvature and its derivatives are exact; `assemble` interpolates between
+        its values at the nodes. Traced parameters belong in a `jax.tree_util.Partial` or an Equinox module.
 
         Examples:
             >>> grid = hj.Grid.from_bounds(1, 2, (9, 9))
@@ -109,12 +108,12 @@ class TensorField(eqx.Module):
 
         There is no default for ``metric``, because several conventions are in use:
 
-        - ``"inverse"``: g = D⁻¹, whose distances are those of diffusion with diffusivity D (t in units of time);
+        - ``"inverse"``: g = D⁻¹, whose distances are the distances of diffusion with diffusivity D (t in units of
+          time);
         - ``"tensor"``: g = D, as in Zobel, Reininghaus and Hotz;
         - ``"adjugate"``: g = |D| D⁻¹, the inverse scaled so that |g| = |D|^(d−1).
 
-        The metric g is interpolated between the nodes. With ``"log-euclidean"`` the result is the same as if D were
-        interpolated.
+        The metric g is interpolated between the nodes. With ``"log-euclidean"``, interpolating D would give the same.
 
         Examples:
             >>> metric = hj.TensorField.from_diffusion(field.grid, field.tensors, metric="inverse")
@@ -134,10 +133,11 @@ class TensorField(eqx.Module):
         """Return the metric C = FᵀF of a deformation gradient F (*shape, d, d), the right Cauchy–Green tensor.
 
         ``F[..., i, j]`` is ∂yᵢ/∂xⱼ, where y is the position to which the point x moves, or would move without
-        constraints. Lengths are those after the deformation. Rotations after F do not change the metric.
+        constraints. The metric measures lengths after the deformation. A later rotation does not change it.
 
-        If F is the gradient of a map, the metric is flat, and the signature is that of the deformed body. For growth,
-        plastic or elastic strain, the curvature of C is the incompatibility, or residual strain. See docs/strain.md.
+        If F is the gradient of a map, the metric is flat, and the signature is the signature of the deformed body. For
+        growth, plastic or elastic strain, the curvature of C is the incompatibility, or residual strain
+        (docs/strain.md).
 
         Args:
             grid: the grid of the undeformed coordinates x.
@@ -170,7 +170,7 @@ class TensorField(eqx.Module):
     ) -> "TensorField":
         """Return a metric made of symmetric tensors S (*shape, d, d) with eigenvalues of either sign, such as stress.
 
-        Such tensors are not a metric themselves. There are two maps to a metric, and no default. Both keep the
+        Indefinite tensors are no metric. The function has two maps to a metric, and no default. Both maps keep the
         eigenvectors and the order of the eigenvalues (Hotz and others 2004):
 
         - ``"exp"``: g = exp(S/s), where `number` is the scale s > 0 in the units of S. An eigenvalue σ becomes
@@ -184,8 +184,8 @@ class TensorField(eqx.Module):
             S: the tensors; values outside the mask are ignored.
             how: ``"exp"`` or ``"shift"``.
             number: the scale or the shift; may be traced.
-            interpolation: the interpolation of g between the nodes. With ``"exp"``, ``"log-euclidean"`` interpolates S
-                linearly.
+            interpolation: the interpolation of g between nodes. With ``"exp"``, ``"log-euclidean"`` is linear
+                interpolation of S.
             name: the name of S in messages.
 
         Raises:
@@ -226,7 +226,7 @@ def _metric_of_diffusion(xp: Any, D: Any, metric: MetricChoice) -> Any:
 
 def _evaluate(function: jtu.Partial, grid: Grid) -> Float[Array, "*shape_and_components"]:
     # Outside the mask the function may be singular, and 0·NaN would spoil derivatives with respect to its parameters.
-    # So it is evaluated at a node inside instead.
+    # So the function is evaluated at a node inside the mask instead.
     inside = grid.inside
     nodes = jax_array(np.where(inside[..., None], grid.nodes, grid.nodes[inside][0]).reshape(-1, grid.dimension))
     flat = jax.vmap(lambda x: real_array("fn", function(x)))(nodes).astype(nodes.dtype)

@@ -23,8 +23,8 @@ oriented simplex are oriented outward."""
 class Triangulation(ByKey):
     """The connectivity of a mesh of triangles or tetrahedra, static and hashable.
 
-    Facets are the edges of triangles, or the triangles of tetrahedra. They are numbered cell by cell: facet
-    (d + 1) c + i is opposite corner i of cell c. A facet between two cells has two numbers.
+    Facets are the edges of triangles, or the triangles of tetrahedra. Facets are numbered cell by cell: facet (d + 1) c
+    + i is opposite corner i of cell c. A facet between two cells has two numbers.
     """
 
     def __init__(self, cells: Int[np.ndarray, "n corners"], n_vertices: int) -> None:
@@ -49,7 +49,7 @@ class Triangulation(ByKey):
 
     @cached_property
     def _grouped_facets(self) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-        """All facets, grouped by their vertices; whether each is the first of its group; the parity of each facet."""
+        """The facets sorted by their vertices; whether each is the first with these; the parity of their order."""
         vertices = self.facet_vertices(np.arange(self.cells.size))
         odd = np.zeros(len(vertices), dtype=bool)
         for a, b in combinations(range(self.dimension), 2):
@@ -62,13 +62,13 @@ class Triangulation(ByKey):
 
     @cached_property
     def boundary_facets(self) -> Int[np.ndarray, " m"]:
-        """The facets that belong to one cell only, in ascending order."""
+        """The facets that belong to only one cell, in ascending order."""
         order, begins, _ = self._grouped_facets
         return np.sort(order[begins & np.append(begins[1:], True)])
 
     @cached_property
     def overlaps(self) -> Int[np.ndarray, "m 2"]:
-        """Pairs of cells with a common facet of the same orientation: positive cells lie on the same side of it.
+        """Pairs of cells with a common facet of the same orientation: positive cells lie on one side of the facet.
 
         If three or more cells share a facet, two of them lie on the same side.
         """
@@ -79,19 +79,19 @@ class Triangulation(ByKey):
 
     @cached_property
     def crowded_facets(self) -> Int[np.ndarray, " m"]:
-        """The facets that belong to three or more cells, with one number for each."""
+        """The facets that belong to three or more cells, each by one of its numbers."""
         order, begins, _ = self._grouped_facets
         starts = np.flatnonzero(begins)
         return order[starts[np.diff(np.append(starts, order.size)) > 2]]
 
     @cached_property
     def boundary_vertices(self) -> Bool[np.ndarray, " V"]:
-        """The vertices on facets that belong to one cell only, bool (V,)."""
+        """Whether each vertex is on a facet that belongs to only one cell, bool (V,)."""
         return np.isin(np.arange(self.n_vertices), self.facet_vertices(self.boundary_facets))
 
     @cached_property
     def _edges(self) -> tuple[Int[np.ndarray, "E 2"], Int[np.ndarray, "n m"]]:
-        """The edges, and the numbers of each cell's edges in the order of ``combinations``."""
+        """The edges, and the numbers of each cell's edges in the order of ``combinations`` of its corners."""
         pairs = list(combinations(range(self.dimension + 1), 2))
         ends = np.sort(self.cells[:, pairs], axis=-1)
         keys, numbers = np.unique(ends[..., 0] * self.n_vertices + ends[..., 1], return_inverse=True)
@@ -109,7 +109,7 @@ class Triangulation(ByKey):
 
     @cached_property
     def boundary_edges(self) -> Bool[np.ndarray, " E"]:
-        """The edges of facets that belong to one cell only, bool (E,)."""
+        """Whether each edge is on a facet that belongs to only one cell, bool (E,)."""
         corners = self.facet_vertices(self.boundary_facets)
         ends = np.sort(corners[:, list(combinations(range(self.dimension), 2))], axis=-1).reshape(-1, 2)
         keys, own = (pairs[:, 0] * self.n_vertices + pairs[:, 1] for pairs in (self.edges, ends))
@@ -117,7 +117,7 @@ class Triangulation(ByKey):
 
     @cached_property
     def used(self) -> Bool[np.ndarray, " V"]:
-        """The vertices that belong to a cell, bool (V,): all except those outside of a mask."""
+        """Whether each vertex belongs to a cell, bool (V,). All vertices do, except outside of a mask."""
         return np.isin(np.arange(self.n_vertices), self.cells)
 
     @cached_property

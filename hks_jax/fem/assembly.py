@@ -46,8 +46,8 @@ def assemble(
 
     A *field* is a number, an array over the nodes, an array over the elements, or a function of position that JAX can
     trace. An array over the nodes, (*shape) or (V,), is interpolated. An array over the elements has n − 1 entries
-    along each axis of a grid (n if the axis is periodic), or an entry for each cell of a mesh. An array that fits both
-    is taken as nodal.
+    along each axis of a grid (n if the axis is periodic), or an entry for each cell of a mesh. An array whose shape
+    fits both is taken as nodal.
 
     Args:
         domain: a tensor field, a `SurfaceMesh` or a `TetMesh`.
@@ -55,9 +55,9 @@ def assemble(
             is node 0: an axis of n nodes has the period n·h), ``"mirror"`` (the domain is reflected on every side) or
             ``"mean"`` (two copies of the domain are glued along the whole rim). On grids give one name for all axes, or
             one entry per axis, which may be a pair (low, high) of ``"neumann"``, ``"dirichlet"`` and ``"mean"``. The
-            rim of a mask is natural, except under ``"mean"`` and ``"dirichlet-rim"``, which act on the rim and on all
-            sides. A further entry after those of the axes sets the condition on the rim: ``("periodic", "periodic",
-            "dirichlet")``. On meshes ``"neumann"``, ``"dirichlet"`` and ``"mean"`` act on the boundary.
+            condition on the rim of a mask is natural, except with ``"mean"`` and ``"dirichlet-rim"``, which act on the
+            rim and on all sides. A further entry after those of the axes sets the condition on the rim: ``("periodic",
+            "periodic", "dirichlet")``. On meshes ``"neumann"``, ``"dirichlet"`` and ``"mean"`` act on the boundary.
         mass: ``"consistent"``, ``"lumped"`` (the diagonal matrix of row sums), or your own form.
         potential: a field V of either sign; the operator becomes −Δ + V.
         density: a positive field ρ; the operator becomes −ρ⁻¹ div(ρ ∇·), in L² with the volume element ρ√|T| dx.
@@ -80,8 +80,8 @@ def assemble(
             all signatures compute nodal values as ½(I + D⁻¹M)φ, where D has the row sums of M.
 
     Returns:
-        The pencil (stiffness, mass). With ``"mirror"`` and ``"mean"`` it is the `MirrorPencil` of the problems into
-        which the doubled domain decomposes. With a potential or your own form, the null space is not known.
+        The pencil (stiffness, mass). With ``"mirror"`` and ``"mean"`` the result is the `MirrorPencil` of the problems
+        into which the doubled domain decomposes. With a potential or your own form, the null space is not known.
 
     Raises:
         ValueError: an unknown boundary, mass, degree or quadrature; a domain without elements or free nodes; ``"mean"``
@@ -133,10 +133,10 @@ def assemble(
         if domain._tensors is not None and domain._tensors.ndim > domain.grid.dimension + 2:
             raise ValueError("domain: got a batch of tensor fields; expected one field. Map over the batch by jax.vmap")
         if degree != 1 or midpoints is not None:
-            raise ValueError(f"degree, midpoints: got {degree!r} for a grid, whose elements are Q1; leave both out")
+            raise ValueError("degree, midpoints: got one of them for a grid, whose elements are Q1; leave both out")
         sides = normalise_boundary(boundary, domain.grid.dimension)
         if components > 1 and any("mirror" in pair for pair in sides):
-            raise ValueError('boundary: got "mirror" with components; expected a boundary for vector-valued functions')
+            raise ValueError('boundary: got "mirror" with components; only scalar functions support "mirror"')
         spaces = [grid_space(domain.grid, problem) for problem in doubled_problems(sides)]
         if any("dirichlet" in pair for pair in sides) and (spaces[0].free == spaces[0].domain).all():
             where = (
@@ -173,7 +173,7 @@ def _checked_operator(
         raise ValueError(f"stiffness: got {type(stiffness).__name__}; expected a form: a function of u, v and w")
     for name, form in (("stiffness", stiffness), ("mass", mass)):
         if is_traced([cell.cell_contents for cell in getattr(form, "__closure__", None) or ()]):
-            raise ValueError(f"{name}: the form closes over traced values; pass these, also numbers, as fields={{…}}")
+            raise ValueError(f"{name}: the form closes over traced arrays or numbers; pass all of them as fields={{…}}")
     require_count("components", components)
     own, given = stiffness is not None or callable(mass), dict(fields or {})
     named = {name: value for name, value in (("potential", potential), ("density", density)) if value is not None}
@@ -183,9 +183,9 @@ def _checked_operator(
             "the field in the form"
         )
     if (given or components > 1) and not own:
-        raise ValueError("fields, components: these are for a form of your own; pass it as stiffness= or mass=")
+        raise ValueError("fields, components: only a form of your own can use them; pass a form as stiffness= or mass=")
     if components > 1 and stiffness is None:
-        raise ValueError("stiffness: got None with components; expected a form for functions with several components")
+        raise ValueError("stiffness: got None with components > 1; expected a form for vector-valued functions")
     of_mass = mass if callable(mass) else l2
     return WeakForm(stiffness or laplace_beltrami, of_mass, mass == "lumped", components, own), given | named
 

@@ -23,9 +23,10 @@ _WHOLE_RIM = {"mean": "mean", "dirichlet-rim": "dirichlet"}
 
 
 def normalise_boundary(boundary: BoundarySpec, dimension: int) -> tuple[Sides, ...]:
-    """Return the conditions (low, high) of every axis and, as last pair, twice the condition on the rim of a mask.
+    """Return a pair of conditions (low, high) for every axis, and a pair that repeats the condition on a mask's rim.
 
-    `assemble` describes the argument. By default the rim has the mean if an axis has it, and is natural otherwise.
+    `assemble` describes the argument. By default, the rim's condition is ``"mean"`` if an axis has it, and natural
+    otherwise.
     """
     if isinstance(boundary, str):
         everywhere = _WHOLE_RIM.get(boundary)
@@ -33,7 +34,7 @@ def normalise_boundary(boundary: BoundarySpec, dimension: int) -> tuple[Sides, .
     elif not isinstance(boundary, tuple | list) or len(boundary) not in (dimension, dimension + 1):
         raise ValueError(
             f"boundary: got {boundary!r}; expected one name, or a tuple of {dimension} entries, one per axis, "
-            f"or of {dimension + 1} entries, of which the last is for the rim of a mask"
+            f"or of {dimension + 1} entries, the last one for the rim of a mask"
         )
     else:
         entries = tuple(boundary)
@@ -67,8 +68,8 @@ def _pair(entry: str | Sides) -> Sides:
 def default_boundary(inside: Bool[np.ndarray, "*shape"]) -> tuple[str, str]:
     """Return the boundary condition that suits a domain, and the reason.
 
-    It is the mean if the domain has a mask, since the natural condition on its rim would dominate the signature. The
-    command line uses it by default; the functions of the library use ``"neumann"``.
+    The condition is ``"mean"`` if the domain has a mask, since the natural condition on its rim would dominate
+    signatures. The command line uses this condition by default; the functions of the library use ``"neumann"``.
 
     Args:
         inside: (*shape) the nodes of the domain, such as `Grid.inside`.
@@ -101,12 +102,12 @@ def unreached_sides(inside: Bool[np.ndarray, "*shape"], boundary: BoundarySpec) 
 
 
 def doubled_problems(boundary: tuple[Sides, ...]) -> list[tuple[Sides, ...]]:
-    """Return the problems whose spectra together form that of the domain doubled by ``"mirror"`` or ``"mean"``.
+    """Return the problems whose spectra form the spectrum of the domain that ``"mirror"`` or ``"mean"`` doubles.
 
-    Functions on the doubled, periodic axis are even or odd about both mirrors. Even functions satisfy the Neumann
-    condition there, and odd functions vanish. So a mirror axis gives a Neumann and a Dirichlet problem, and m mirror
-    axes give 2^m problems. Likewise, two copies of a domain that are glued along the rim have even functions (Neumann)
-    and odd functions (Dirichlet). In the first problem, functions are even under all reflections.
+    Functions on the doubled, periodic axis are even or odd about both mirrors. At the mirrors, even functions satisfy
+    the Neumann condition, and odd functions vanish. So a mirror axis gives a Neumann and a Dirichlet problem, and m
+    mirror axes give 2^m problems. Likewise, two copies of a domain that are glued along the rim have even functions
+    (Neumann) and odd functions (Dirichlet). In the first problem, functions are even under all reflections.
     """
     choices = [
         [("neumann", "neumann"), ("dirichlet", "dirichlet")] if sides == ("mirror", "mirror") else [sides]

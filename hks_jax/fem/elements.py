@@ -27,23 +27,19 @@ class Element:
     gradients: Float[np.ndarray | Array, "q n d"]
     weights: Float[np.ndarray | Array, " q"]
 
-    def stretched(self, sides: tuple[float, ...]) -> "Element":
-        """Return the element with its sides multiplied by these factors."""
-        return Element(self.values, self.gradients / np.array(sides), self.weights * math.prod(sides))
-
 
 def element_matrices(
     metric: Float[Array, "q d d"],
     element: Element,
-    form: WeakForm = WeakForm(),  # noqa: B008
-    x: Float[Array, "q m"] | None = None,
-    fields: Mapping[str, Array] | None = None,
+    form: WeakForm,
+    x: Float[Array, "q m"] | None,
+    fields: Mapping[str, Array],
     frames: Float[Array, "q m d"] | None = None,
 ) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
-    """Return stiffness and mass of one element, by default ∫ √|T| T⁻¹∇hᵢ·∇hⱼ and ∫ √|T| hᵢhⱼ.
+    """Return stiffness and mass of one element.
 
-    The metric T, the positions x and the fields are given at the quadrature points. With the frames ∂x/∂ξ of the
-    element's coordinates ξ, forms see gradients and metric in the axes of space; otherwise in the coordinates ξ.
+    The metric T, the positions x and the fields are given at the quadrature points. If the frames ∂x/∂ξ are given,
+    gradients and metric in forms refer to the axes of space, otherwise to the element's coordinates ξ.
     """
     h, dh = jnp.asarray(element.values, metric.dtype), jnp.asarray(element.gradients, metric.dtype)
     volume = jnp.asarray(element.weights, metric.dtype) * jnp.sqrt(spd.determinant(metric))
@@ -54,7 +50,7 @@ def element_matrices(
         dh = product("qxa,qia->qix", dual, dh)
         metric, inverse = (product("qxa,qab,qyb->qxy", f, t, f) for f, t in ((dual, metric), (frames, inverse)))
     functions = of_components(ShapeFunction(h, dh), form.components)
-    points = Point(metric, inverse, x, fields or {})
+    points = Point(metric, inverse, x, fields)
     stiffness, mass = (integrate(each, volume, functions, points) for each in (form.stiffness, form.mass))
     return (stiffness, mass) if form.checked else (symmetric_or_nan(stiffness), symmetric_or_nan(mass))
 
@@ -86,8 +82,8 @@ def _linear_rule(d: int) -> tuple[Float[np.ndarray, "q n"], Float[np.ndarray, " 
     return points, np.full(d + 1, 1 / math.factorial(d + 1))
 
 
-# Radon's rule has 7 points in a triangle, and Keast's has 15 points in a tetrahedron: the centre, two orbits near the
-# corners and, in 3D, one orbit near the midpoints of the edges.
+# Radon's rule has 7 points in a triangle, and Keast's has 15 points in a tetrahedron: the centre, an orbit near the
+# corners, an orbit near the centres of the sides and, in 3D, an orbit near the midpoints of the edges.
 def _quadratic_rule(d: int) -> tuple[Float[np.ndarray, "q n"], Float[np.ndarray, " q"]]:
     """Return the barycentric coordinates and weights of a rule that is exact for degree five."""
     root, n = math.sqrt(15), d + 1
@@ -129,7 +125,8 @@ Quadrature = Literal["gauss", "cancelling"]
 MASS = math.sqrt(2 / 3)
 """The coordinate ξ of the points ±ξ on each axis of [−1, 1]^d where the mass evaluates shape functions."""
 _LEAST, _GREATEST = 0.01, 1.0
-"""Bounds of ξ² for the stiffness, so that points are in the cell and not at its centre (hourglasses have no energy)."""
+"""Bounds of ξ² for the stiffness, so that points are in the cell, but not at its centre, where hourglass modes have no
+energy."""
 
 
 # Let the tensor T be constant, A = T⁻¹, hₐ the spacings, k the wave vector of a plane wave, and θₐ = kₐhₐ. With points
@@ -139,15 +136,15 @@ _LEAST, _GREATEST = 0.01, 1.0
 #
 #     λ + λ μ Σₐ θₐ² − Σₐ Aₐₐkₐ² (θₐ²/12 + ν Σ_{b≠a} θᵦ²) − Σ_{a<b} 2Aₐᵦkₐkᵦ ((θₐ² + θᵦ²)/6 + ν Σ_{c≠a,b} θ_c²).
 #
-# For μ = ν = 1/12 the error −Σ_{a<b} 2Aₐᵦkₐkᵦ (θₐ² + θᵦ²)/12 remains, which is zero for a diagonal tensor. Otherwise no
-# stencil with 3^d couplings cancels it for every k. But ν = 1/12 + δ cancels its mean over the heat kernel, in which θ
-# is normal with a covariance proportional to S, where Sₐᵦ = hₐhᵦTₐᵦ. Let A now be the inverse of S. With Isserlis'
-# theorem E θₐθᵦθ_cθ_e = SₐᵦS_ce + Sₐ_cSᵦ_e + Sₐ_eSᵦ_c,
+# For μ = ν = 1/12 the error −Σ_{a<b} 2Aₐᵦkₐkᵦ (θₐ² + θᵦ²)/12 remains, which is zero for a diagonal tensor. For other
+# tensors, no stencil with 3^d couplings cancels the error for every k. But ν = 1/12 + δ cancels the mean of the error
+# over the heat kernel, in which θ is normal with a covariance proportional to S, where Sₐᵦ = hₐhᵦTₐᵦ. Let A now be the
+# inverse of S. With Isserlis' theorem E θₐθᵦθ_cθ_e = SₐᵦS_ce + Sₐ_cSᵦ_e + Sₐ_eSᵦ_c,
 #
 #     δ = −(1/12) Σ_{a<b} 2Aₐᵦ E(θₐ³θᵦ + θₐθᵦ³) / (Σ_{a≠b} Aₐₐ E θₐ²θᵦ² + Σ_{a<b} Σ_{c≠a,b} 2Aₐᵦ E θₐθᵦθ_c²);
 #
 # δ depends neither on t nor on the size of S. In two dimensions δ = S₁₂²/2(S₁₁S₂₂ + 2S₁₂²), so that ξ² = 2/3 − 4δ is
-# between 0 and 2/3. The denominator is positive: it is the sum over c of E θ_c² times the energy along the other axes.
+# between 0 and 2/3. The denominator is positive: it equals Σ_c E(θ_c² Σ_{a,b≠c} Aₐᵦθₐθᵦ).
 #
 # The nodal values of functions of norm 1 are too large by the factor 1 + Σ μθₐ²/2, which `Pencil.read` corrects.
 def stiffness_point(metric: Float[Array, "d d"], spacing: Float[np.ndarray | Array, " d"]) -> Float[Array, ""]:
@@ -170,8 +167,9 @@ def stiffness_point(metric: Float[Array, "d d"], spacing: Float[np.ndarray | Arr
 # them accurately: with tensors at the new points, errors on brains were twice as large.
 #
 # On a cell, a function is a linear combination of products of coordinates, one for each set of axes. The derivative of
-# a product of m coordinates has m − 1 of them, which grow with ξ. So the stiffness for points ±ξ is the one for Gauss
-# points ±ξ₀ with each such product multiplied by (ξ/ξ₀)^(m−1). Their values at the corners, ±1, make them orthogonal.
+# a product of m coordinates is a product of m − 1 coordinates, which are ±ξ at the points. So the stiffness for points
+# ±ξ is that for Gauss points ±ξ₀ with the derivative of each product multiplied by (ξ/ξ₀)^(m−1). The products are
+# orthogonal, because their values at the corners are ±1.
 def moved(
     stiffness: Float[Array, "n n"], metric: Float[Array, "q d d"], spacing: Float[np.ndarray | Array, " d"]
 ) -> Float[Array, "n n"]:
@@ -185,7 +183,7 @@ def moved(
 
 @lru_cache(maxsize=2)
 def _products_of_coordinates(dimension: int) -> tuple[Float[np.ndarray, "nn nn"], Float[np.ndarray, " n"]]:
-    """Return the change of matrices to the basis of products of coordinates and back, and max(m − 1, 0) for each."""
+    """Return the transform of matrices to the basis of products of coordinates and back, and max(m − 1, 0) for each."""
     one = np.array([[1.0, 1.0], [1.0, -1.0]]) / np.sqrt(2)
     basis = reduce(np.kron, [one] * 2 * dimension)
     degrees = np.indices((2,) * dimension).sum(axis=0).ravel()

@@ -31,9 +31,9 @@ def factorise(
 
     The matrix A may be indefinite. All results are differentiable with respect to K, M, σ and right-hand sides, in
     forward and reverse mode to any order, under `jit` and `vmap`. The elimination is a multifrontal LDLᵀ along a nested
-    dissection, without pivoting across fronts. Its accuracy is tested on random right-hand sides. If small pivots spoil
-    it, the elimination is repeated with these pivots replaced, and solutions are refined iteratively. If values are
-    traced, results of a singular matrix are NaN, and ``.sound`` is False.
+    dissection, without pivoting across fronts. Its accuracy is tested on random right-hand sides. If small pivots make
+    it inaccurate, the elimination is repeated with these pivots replaced, and solutions are refined iteratively. If
+    values are traced, results of a singular matrix are NaN, and ``.sound`` is False.
 
     Args:
         domain: a tensor field, a mesh, a pencil, a symmetric sparse matrix K (then M is the identity), or (K, M), as
@@ -43,8 +43,8 @@ def factorise(
         mass: likewise.
 
     Raises:
-        ValueError: a shift that is not a finite number; a singular matrix (with the number of its null vectors); a
-            domain that `eigenpairs` refuses; a doubled domain.
+        ValueError: a shift that is not a finite number; a singular matrix (the message has the number of null vectors);
+            a domain that `eigenpairs` refuses; a doubled domain.
 
     Examples:
         >>> A = hj.factorise(np.array([[2.0, 1.0], [1.0, 2.0]]))
@@ -156,7 +156,8 @@ class Multifrontal(lx.AbstractLinearSolver[_State]):
 
     A `SparseLinearOperator`, multiples and sums of these, and real tridiagonal operators are factorised as sparse
     matrices. All other operators are converted by ``as_matrix`` and take n³ operations; a complex operator takes as
-    many as a real one of twice the size. Derivatives are those of lineax. The matrix must be nonsingular.
+    many operations as a real operator of twice the size. Derivatives are those of lineax. The matrix must be
+    nonsingular.
 
     Examples:
         >>> import lineax
@@ -174,8 +175,8 @@ class Multifrontal(lx.AbstractLinearSolver[_State]):
         definite = lx.is_positive_semidefinite(operator) or lx.is_negative_semidefinite(operator)
         if not (lx.is_symmetric(operator) or definite):
             raise ValueError(
-                "operator: got one that is not known to be symmetric or Hermitian; if it is, add a tag, such as "
-                "`lineax.TaggedLinearOperator(operator, lineax.symmetric_tag)`, or use `lineax.LU`"
+                "operator: got an operator that is not known to be symmetric or Hermitian; if it is, add a tag, such "
+                "as `lineax.TaggedLinearOperator(operator, lineax.symmetric_tag)`, or use `lineax.LU`"
             )
         if not jnp.issubdtype(jnp.result_type(*jax.tree.leaves(operator.in_structure())), jnp.complexfloating):
             return _State(factorised(_patterned(operator), "operator"), None)
@@ -185,7 +186,7 @@ class Multifrontal(lx.AbstractLinearSolver[_State]):
         return _State(factorised(_full(jnp.block([[real, -imaginary], below])), "operator"), hermitian)
 
     def compute(self, state: _State, vector: Any, options: dict[str, Any]) -> tuple[Any, lx.RESULTS, dict[str, Any]]:
-        """Solve with a factorised operator; for a singular operator it is NaN, which lineax reports as singular."""
+        """Solve with a factorised operator; if it is singular, the solution is NaN, and lineax reports this."""
         flat, unflatten = ravel_pytree(vector)
         return unflatten(state.solve(flat)), lx.RESULTS.successful, {}
 

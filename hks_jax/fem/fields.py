@@ -52,14 +52,14 @@ def checked_field(
 ) -> Field:
     """Return the `Field` of a number, an array over nodes or elements, or a function of position.
 
-    Values outside the domain are ignored. If a field must be positive, traced values that are not become NaN. Functions
-    are evaluated at the quadrature points, and only then `positions` is called.
+    Values outside the domain are ignored. If a field must be positive, traced values that are not positive become NaN.
+    Functions are evaluated at the quadrature points; `positions` is called only for functions.
 
     Raises:
-        ValueError: another shape; values that are NaN, infinite or not positive (with their number and the first one).
+        ValueError: another shape; values that are NaN, infinite or not positive (the message has their number).
     """
     values, at, inside = _placed(name, given, space, positions)
-    # If a field has several numbers at each place, one wrong number makes the place wrong.
+    # If a field has several numbers at each place, a place with one wrong number counts as wrong.
     rest = values.ndim - (0 if inside is None else inside.ndim)
     if scalar and rest:
         raise ValueError(f"{name}: got shape {values.shape}; expected one number at each place: {_expected(space)}")

@@ -131,7 +131,7 @@ class Slabs:
         return jax.jit(self._padded, static_argnums=1, out_shardings=NamedSharding(self.mesh, self.spec(axis)))(x, axis)
 
     def join(self, x: Array, axis: int = 0) -> Array:
-        """Remove the padding. If there was any, every device holds the whole result."""
+        """Remove the padding. If there was padding, every device holds the whole result."""
         return jax.lax.slice_in_dim(x, 0, self.shape[0], axis=axis)
 
     @partial(jax.jit, static_argnums=0)
@@ -173,7 +173,7 @@ class Slabs:
         if self.periodic[0]:
             up, down = [*up, (last, 0)], [*down, (0, last)]
             if planes + 1 < self.thickness:
-                # In the last slab that has nodes, padding follows them, and the plane above belongs right after them.
+                # In the last slab that has nodes, the plane above is placed right after the nodes, before the padding.
                 is_last = jax.lax.axis_index(self.name) == last
                 top = jnp.where(is_last, jax.lax.slice_in_dim(x, planes, planes + 1, axis=0), top)
                 place = jnp.where(is_last, planes + 2, place)

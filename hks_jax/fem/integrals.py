@@ -31,16 +31,17 @@ _ON_HOST = 1 << 17
 
 def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace, operator: WeakForm) -> Pencil:
     """Return the pencil of a field, or of one part of a doubled domain."""
-    # Masks, element and spacing are passed as arrays, so that problems that differ only in them share one compilation.
-    # The element is computed in double precision, since its rounding would scale the whole metric.
-    tensors, spacing = field.tensors, field.grid.spacing
-    element = tensor_product_element(space.dimension).stretched(spacing)
-    gradients, weights, steps = (np.asarray(x, tensors.dtype) for x in (element.gradients, element.weights, spacing))
+    # Masks, element and spacing are passed as arrays, so that problems that differ only in these arrays share one
+    # compilation. The element is computed in double precision, since its rounding would scale the whole metric.
+    tensors, spacing = field.tensors, np.array(field.grid.spacing)
+    element = tensor_product_element(space.dimension)
+    table = element.gradients / spacing, element.weights * spacing.prod(), spacing
+    gradients, weights, steps = (np.asarray(x, tensors.dtype) for x in table)
     domain, elements = (mask_for(tensors, mask) for mask in (space.domain, space.elements))
     couplings, settings = couplings_for(tensors, space), (space.periodic, field.interpolation, operator)
     x = grid_points(field.grid, space, tensors.dtype) if operator.own else None
-    table = gradients, weights, steps
-    *matrices, lumped, volume = _grid_integrals(tensors, domain, elements, couplings, *table, x, fields, *settings)
+    arrays = tensors, domain, elements, couplings, gradients, weights, steps
+    *matrices, lumped, volume = _grid_integrals(*arrays, x, fields, *settings)
     metric = SampledMetric(jax.lax.stop_gradient(tensors), steps, field.interpolation)
     if operator.components > 1:
         own, kept = vector_space(space, operator.components), np.flatnonzero(space.elements)
@@ -52,7 +53,7 @@ def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace
 
 
 def grid_points(grid: Grid, space: GridSpace, dtype: Any) -> Float[Array, "*elements q d"]:
-    """Return the positions of the quadrature points; for elements outside the domain, those of an element inside."""
+    """Return the positions of the quadrature points; elements outside the domain get the positions of one inside."""
     first = np.argwhere(space.elements)[0].astype(dtype)
     corners = np.array(list(product((0.0, 1.0), repeat=space.dimension)))
     inner = tensor_product_element(space.dimension).values @ corners
@@ -208,7 +209,7 @@ def _stencil(matrices: Float[Array, "*elements n n"], periodic: tuple[bool, ...]
         total = total + jnp.pad(couplings[a], [(1 - i, i) for i in node] + [(i, 1 - i) for i in node])
     total = total.reshape(3**d, *total.shape[d:])
     for axis, wraps in enumerate(periodic, start=1):
-        if wraps:  # the last node equals the first
+        if wraps:  # on a periodic axis, the last node is the first
             inner = jax.lax.slice_in_dim(total, 0, -1, axis=axis)
             last = jax.lax.slice_in_dim(total, -1, None, axis=axis)
             total = inner + jnp.pad(last, [(0, n - 1 if a == axis else 0) for a, n in enumerate(inner.shape)])
@@ -257,7 +258,7 @@ def assemble_mesh(
     space: MeshSpace,
     operator: WeakForm,
 ) -> Pencil:
-    """Return the pencil of a mesh; if it is ``curved``, its edges pass through their midpoints."""
+    """Return the pencil of a mesh; if it is ``curved``, its edges pass through the given midpoints."""
     element = simplex_element(space.dimension, space.degree)
     shape = len(space.cells), element.weights.size
     if curved:

@@ -57,7 +57,7 @@ class NodalPencil(eqx.Module):
         return NodalPencil(self.stiffness.own(slabs), self.mass.own(slabs), *masks)
 
     def products(self) -> Callable[[Float[Array, "*shape b"]], tuple[Float[Array, "*shape b"], ...]]:
-        """Return x ↦ (Kx, Mx), which fetches neighbours once for both; call this outside of a loop."""
+        """Return x ↦ (Kx, Mx), which reads neighbours once for both; call this before a loop of products."""
         stiffness, mass = self.stiffness.of_rimmed(), self.mass.of_rimmed()
 
         def both(x: Float[Array, "*shape b"]) -> tuple[Float[Array, "*shape b"], ...]:
@@ -87,13 +87,13 @@ def lump(stiffness: Stencil, mass: Stencil, free: Bool[Array, "*shape"], domain:
 
 
 def nodal_pencil(pencil: Pencil) -> NodalPencil:
-    """Return the pencil of a grid on nodal arrays."""
+    """Return the matrices of a grid's pencil as stencils on nodal arrays."""
     space = pencil.space
     assert isinstance(space, GridSpace)
     stiffness, mass = (
         Stencil(coefficients_of(each, space), space.periodic) for each in (pencil.stiffness, pencil.mass)
     )
-    # Under `jit` the masks are constants, and without the barrier the compiler would compute with them.
+    # Under `jit` the masks are constants, and without the barrier the compiler would evaluate expressions of them.
     masks = (jnp.asarray(mask_for(pencil, mask)) for mask in (space.free, space.domain))
     return lump(stiffness, mass, *jax.lax.optimization_barrier(tuple(masks)))
 
@@ -111,16 +111,17 @@ def to_rows(columns: Float[Array, "*shape b"]) -> Float[Array, "b nodes"]:
 
 
 _FILLED = {2: 0.45, 3: 0.6}
-"""The least fraction of free nodes, by dimension. If half are free, later calls in 2D are 1.4 to 1.9 times slower, and
-about ten of them lose the time that the first call saves. In 3D the cost of a factorisation grows faster."""
+"""The least fraction of free nodes for `on_all_nodes`, by dimension. In 2D with half of the nodes free, later calls are
+1.4 to 1.9 times slower, and about ten calls lose the time that the first call saves. In 3D the cost of a factorisation
+grows faster."""
 
 
 def on_all_nodes(pencil: AnyPencil, k: int = 0) -> AnyPencil:
     """Return a pencil on all nodes of a grid with the same lowest eigenpairs, if that is faster.
 
     Each node i that is not free gets a separate equation, Kᵢᵢ = σMᵢᵢ, with an eigenvalue σ above the lowest quarter of
-    the spectrum; other eigenvectors vanish there. The pencil is returned unchanged if the number k of pairs exceeds
-    that quarter, or if values are traced, since code is then compiled for each mask anyway.
+    the spectrum; the other eigenvectors vanish at this node. The pencil is returned unchanged if the number k of pairs
+    exceeds a quarter of its size, or if values are traced, since code is then compiled for each mask anyway.
     """
     parts = tuple(_of_one(part) if 4 * k <= part.size else part for part in pencil.parts)
     return parts[0] if isinstance(pencil, Pencil) else MirrorPencil(parts, pencil.including)
@@ -128,12 +129,9 @@ def on_all_nodes(pencil: AnyPencil, k: int = 0) -> AnyPencil:
 
 def _of_one(pencil: Pencil) -> Pencil:
     space = pencil.space
-    known = not is_traced(jax.lax.stop_gradient(pencil.stiffness))
-    if not (
-        known
-        and isinstance(space, GridSpace)
-        and _FILLED[space.dimension] * space.free.size <= space.n_dof < space.free.size
-    ):
+    if is_traced(jax.lax.stop_gradient(pencil.stiffness)) or not isinstance(space, GridSpace):
+        return pencil
+    if not _FILLED[space.dimension] * space.free.size <= space.n_dof < space.free.size:
         return pencil
     natural = ("neumann", "neumann")
     sides = [("periodic", "periodic") if wraps else natural for wraps in space.periodic]
@@ -155,7 +153,8 @@ def _of_one(pencil: Pencil) -> Pencil:
 
 # The largest Kᵢᵢ/Mᵢᵢ is a Rayleigh quotient and so at most the largest eigenvalue: the spectrum does not become wider.
 # It exceeds the lowest quarter of the spectrum: on a uniform grid with the consistent mass it is 6/h² in 2D and 9/h² in
-# 3D, and by Weyl's law that quarter ends at 3.1/h² and 6/h². With a lumped mass it is 2.7/h² in both, hence the factor.
+# 3D, and that quarter ends at 3.8/h² and 7.6/h². With a lumped mass it is 2.7/h², and the quarter ends at 2.2/h² and
+# 2.4/h². Because this margin is small, the quotient is doubled; the spectrum then ends at 5.3/h² instead of 4/h².
 @jax.jit
 def _with_others(
     stiffness: Float[Array, "offsets *shape"], mass: Float[Array, "m *shape"], free: Bool[np.ndarray | Array, "*shape"]

@@ -33,8 +33,8 @@ class Pencil(SymmetricPencil):
         null_space: the null space of K ⪰ 0; None if it is not known, in which case K may be indefinite.
         lower_bound: a lower bound of the spectrum, if one is known for a K that may be indefinite; derivatives treat it
             as constant.
-        row_sums: (n_dof,) the row sums of M, including eliminated columns, if nodal values are computed with them, and
-            infinite at nodes where functions vanish; None if the unknowns are the nodal values.
+        row_sums: (n_dof,) the row sums of M, including eliminated columns, from which `read` computes nodal values;
+            infinite at nodes where functions vanish. None if the unknowns are the nodal values.
     """
 
     metric: SampledMetric | None
@@ -66,11 +66,11 @@ class Pencil(SymmetricPencil):
         )
 
     def read(self, functions: Float[Array, "... n_dof"], part: Any = None) -> Float[Array, "... n_dof"]:
-        """Return the values at the free nodes of functions, given their unknowns (see `assemble`)."""
+        """Return the values of functions at the free nodes, given their unknowns (see `assemble`)."""
         return functions if self.row_sums is None else _read(self.mass, self.row_sums, functions)
 
     def integrals(self, values: Float[Array, "... n_dof"]) -> Float[Array, "... n_dof"]:
-        """Return the weights w of ∫φu = w·φ, where φ has nodal values from `read`, and u has the nodal ``values``."""
+        """Return weights w with ∫φu = w·φ, where φ has nodal values from `read`, and u has the nodal ``values``."""
         if self.row_sums is None:
             return self.mass.apply(values)
         return jnp.where(jnp.isinf(self.row_sums), 0, self.row_sums) * values
@@ -140,8 +140,8 @@ class MirrorPencil(eqx.Module):
         return self.parts[0].resolution
 
     def read(self, functions: Float[Array, "k n_dof"], part: Int[Array, " k"] | None) -> Float[Array, "k n_dof"]:
-        """Return the values at the free nodes of functions, given their unknowns and the number of the part of each."""
-        # At the free nodes of a part, its mass equals that of the first part; elsewhere its functions vanish.
+        """Return the values of functions at the free nodes, given their unknowns and each function's part."""
+        # At the free nodes of a part, its mass equals the mass of the first part; at other nodes its functions vanish.
         sums = [
             jnp.where(part.space.free, part.space.extend(part.row_sums, outside=0.0), jnp.inf)
             for part in self.parts

@@ -77,8 +77,9 @@ def _dispersion(xp: Any, tensors: Any, spacing: Any, lumped: bool, cancelling: b
 
 # Between neighbours along axis a, the flux matrix A = √|T| T⁻¹ changes by δA, and an element uses the mean of A. The
 # exact solution u = p·x + w has a corrector w with ∂ₐ(Aₐₐ∂ₐw) = −(∂ₐA eₐ)·p. An element lacks the energy of the
-# corrector, Aₐₐ(∂ₐ²w)² hₐ²/12. If p has the covariance A⁻¹, it is δAeₐ·A⁻¹δAeₐ/12Aₐₐ, relative to the energy of p along
-# one axis. The estimate holds for √t above the length on which A varies; for smaller t only its size is right.
+# corrector, Aₐₐ(∂ₐ²w)² hₐ²/12. If p has the covariance A⁻¹, this energy is δAeₐ·A⁻¹δAeₐ/12Aₐₐ, relative to the energy
+# of p along one axis. The estimate holds for √t above the length on which A varies; for smaller t only its order of
+# magnitude is right.
 def _turning(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...]) -> Any:
     """Return the relative error (*shape) of eigenvalues due to the variation of tensors between neighbours."""
     root = xp.sqrt(spd.determinant(tensors))[..., None, None]
@@ -95,9 +96,9 @@ def _turning(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...]) -> 
     return total
 
 
-# The error of interpolation along axis a is −ξ(h − ξ)/2 times the second derivative, on average −h²/12 times it. The
-# relative error of the density √|T| is half the trace of T⁻¹ times the error of T. This gives tr T⁻¹∂ₐ²T if T is
-# interpolated, and ∂ₐ²log|T| if its logarithm is interpolated.
+# At distance ξ from a node along axis a, the interpolation error is −ξ(h − ξ)/2 times the second derivative. The mean
+# of this factor is −h²/12. The relative error of the density √|T| is half the trace of T⁻¹ times the error of T. This
+# gives tr T⁻¹∂ₐ²T if T is interpolated, and ∂ₐ²log|T| if its logarithm is interpolated.
 def _swelling(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...], interpolation: Interpolation) -> Any:
     """Return the relative error of the domain's volume due to the interpolation between the nodes."""
     determinant, inverse = spd.determinant(tensors), spd.inverse(tensors)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.arrays import ByKey
-from hks_jax.compilation import by_numpy, is_concrete_on_cpu
+from hks_jax.compilation import numpy_where_known
 from hks_jax.domain.components import active_elements, element_nodes, label_nodes, rim_nodes, wrap_nodes
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.triangulation import Triangulation
@@ -96,48 +96,30 @@ class FunctionSpace(ByKey):
             return _reshaped(_spread(values, self._free_indices, fill), shape)
 
     def transfer(self, values: Float[Array, "... n_dof"], to: "FunctionSpace") -> Float[Array, "... n"]:
-        """Return functions of this space as functions of another one on the same nodes, zero at its Dirichlet nodes."""
+        """Convert functions to another space on the same nodes; the results are 0 at Dirichlet nodes of that space."""
         return values if to == self else to.restrict(self.extend(values, outside=0.0))
 
 
-def _reshaped(values: Array, shape: tuple[int, ...]) -> Array:
-    return by_numpy(lambda known: known.reshape(shape), values) if _by_numpy(values) else jnp.reshape(values, shape)
+@numpy_where_known(most=_COPIED, static_argnums=1)
+def _reshaped(xp: Any, values: Any, shape: tuple[int, ...]) -> Any:
+    return xp.reshape(values, shape)
 
 
-def taken(values: Float[Array, "... n"], indices: Int[np.ndarray, " m"]) -> Float[Array, "... m"]:
-    """Return the values at given indices of the last axis."""
-    if _by_numpy(values):
-        return by_numpy(lambda known: np.take(known, indices, axis=-1), values)
-    return _taken(values, indices)
+# The indices are arguments, so that sets of equally many indices share one compilation.
+@numpy_where_known(most=_COPIED)
+def taken(xp: Any, values: Any, indices: Any) -> Any:
+    """Return the values (…, m) at given indices of the last axis."""
+    return xp.take(values, indices, axis=-1, mode="clip")
 
 
-def _spread(
-    values: Float[Array, "... m"], indices: Int[np.ndarray, " m"], fill: Float[np.ndarray, " n"]
-) -> Float[Array, "... n"]:
-    """Return an array with values at given indices of the last axis, and with ``fill`` elsewhere."""
-    if not _by_numpy(values):
-        return _spread_by_jax(values, indices, fill)
-    full = np.tile(fill, (*values.shape[:-1], 1))
+@numpy_where_known(most=_COPIED)
+def _spread(xp: Any, values: Any, indices: Any, fill: Any) -> Any:
+    """Return an array (…, n) with values at given indices of the last axis, and with ``fill`` (n,) elsewhere."""
+    full = xp.tile(fill, (*values.shape[:-1], 1))
+    if xp is jnp:
+        return full.at[..., indices].set(values, unique_indices=True, indices_are_sorted=True)
     full[..., indices] = values
-    return jax.device_put(full)
-
-
-def _by_numpy(values: Array) -> bool:
-    return np.size(values) <= _COPIED and is_concrete_on_cpu(values)
-
-
-# The indices are passed as arrays, so that sets of equally many indices share one compilation.
-@jax.jit
-def _taken(values: Float[Array, "... n"], indices: Int[np.ndarray | Array, " m"]) -> Float[Array, "... m"]:
-    return values[..., indices]
-
-
-@jax.jit
-def _spread_by_jax(
-    values: Float[Array, "... m"], indices: Int[np.ndarray | Array, " m"], fill: Float[np.ndarray | Array, " n"]
-) -> Float[Array, "... n"]:
-    full = jnp.broadcast_to(fill, (*values.shape[:-1], fill.size))
-    return full.at[..., indices].set(values, unique_indices=True, indices_are_sorted=True)
+    return full
 
 
 @jax.tree_util.register_static
@@ -148,8 +130,7 @@ class GridSpace(FunctionSpace):
     """
 
     def __init__(self, grid: Grid, boundary: tuple[Sides, ...]) -> None:
-        self._grid, self.boundary = grid.unit, boundary
-        self.inside = grid.inside
+        self.boundary = boundary
         self.node_shape, self.dimension = grid.shape, grid.dimension
         *axes, rim = boundary
         self.periodic = tuple(sides == ("periodic", "periodic") for sides in axes)
@@ -158,7 +139,7 @@ class GridSpace(FunctionSpace):
         self.elements = active_elements(grid.inside, self.periodic)
         self.domain = element_nodes(self.elements, self.periodic)
         if not self.domain.any():
-            raise ValueError("mask: no element has all its nodes inside; use a thicker mask or a finer grid")
+            raise ValueError("mask: no element has all its nodes inside the mask; use a thicker mask or a finer grid")
         self.free = self.domain.copy()
         for axis, sides in enumerate(axes):
             for end, condition in zip((0, -1), sides, strict=True):
@@ -172,7 +153,7 @@ class GridSpace(FunctionSpace):
                 "finer grid or a thicker mask"
             )
         self._labels, self.n_components = label_nodes(grid.inside, self.periodic)
-        self._key = (self._grid, boundary)
+        self._key = (grid.unit, boundary)
 
     @cached_property
     def cells(self) -> Int[np.ndarray, "E n"]:
@@ -244,7 +225,7 @@ class MatrixSpace(FunctionSpace):
 
 
 def grid_space(grid: Grid, boundary: tuple[Sides, ...]) -> GridSpace:
-    """Return the space of a grid, which grids with the same nodes share."""
+    """Return the space of a grid; grids with the same nodes share one space."""
     return _unit_space(grid.unit, boundary)
 
 
@@ -269,7 +250,7 @@ def mask_for(values: Any, mask: Bool[np.ndarray, "*shape"]) -> Bool[np.ndarray |
 
 
 def couplings_for(values: Any, space: GridSpace) -> Bool[np.ndarray | Array, "offsets *shape"] | None:
-    """Mark the offsets and nodes of couplings with two free ends, for a computation with ``values``.
+    """Return, for each offset and node, whether both coupled nodes are free, for a computation with ``values``.
 
     The result is None if the values are traced and all nodes of the domain are free.
     """
@@ -292,7 +273,7 @@ def _coupled(free: Bool[np.ndarray, "*shape"], periodic: tuple[bool, ...]) -> Bo
 
 
 def _box(mask: Bool[np.ndarray, "*shape"]) -> list[Bool[np.ndarray, " _n"]] | None:
-    """Return a mask for each axis, whose product is the given mask; None if it is not such a product."""
+    """Return one mask per axis, such that their outer product is the given mask; None if there are no such masks."""
     d = mask.ndim
     axes = [np.asarray(mask.any(axis=tuple(a for a in range(d) if a != axis))) for axis in range(d)]
     return axes if mask[np.ix_(*axes)].all() else None
@@ -304,7 +285,7 @@ def _outer(axes: Sequence[Bool[np.ndarray, "_m _n"]]) -> Bool[Array, "ms *ns"]:
     whole = tuple(map(int, shapes.ravel()))
     result = jnp.ones((), bool)
     if not all(axis.all() for axis in axes):
-        # The barrier keeps the compiler from computing the product when it compiles.
+        # The barrier keeps the compiler from computing the product during compilation.
         known = jax.lax.optimization_barrier([jnp.asarray(axis) for axis in axes])
         places = [tuple(n if i % d == axis else 1 for i, n in enumerate(whole)) for axis in range(d)]
         result = reduce(jnp.logical_and, [axis.reshape(place) for axis, place in zip(known, places, strict=True)])

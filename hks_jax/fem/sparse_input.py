@@ -216,8 +216,7 @@ def _entries(name: str, matrix: Any) -> _Entries:
         entries = _Entries(values, rows, cols, matrix.size)
     elif issparse(matrix):
         _check_square(name, matrix.shape)
-        held = matrix.tocoo(copy=True)  # a copy, since the next line changes it
-        held.sum_duplicates()
+        held = matrix.tocsr().tocoo()  # adds entries at equal places
         entries = _Entries(real_array(name, held.data), held.row, held.col, held.shape[0])
     else:
         array = real_array(name, matrix)

@@ -83,7 +83,7 @@ class GridPattern(ByKey, Pattern):
 
 @lru_cache(maxsize=16)
 def _couplings(space: GridSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    # Degrees of freedom are counted from 1, so that 0 is none.
+    # Degrees of freedom are counted from 1, and 0 marks nodes without one.
     own = (space.degrees_of_freedom + 1).reshape(space.node_shape).astype(np.int32)
     where, rows, cols = [], [], []
     for o, other in enumerate(neighbours(with_rim(own, space.periodic), own.ndim)):
@@ -106,7 +106,7 @@ class Stencil(eqx.Module):
 
     coefficients: Float[Array, "offsets *shape"]
     periodic: tuple[bool, ...] = eqx.field(static=True)  # for each axis, whether node n is node 0
-    slabs: Slabs | None = eqx.field(default=None, static=True)  # if this is one device's slab inside `shard_map`
+    slabs: Slabs | None = eqx.field(default=None, static=True)  # the cut of the grid, if this is one slab of it
 
     @property
     def is_diagonal(self) -> bool:
@@ -124,7 +124,7 @@ class Stencil(eqx.Module):
     def of_columns(self) -> Callable[[Float[Array, "*shape b"]], Float[Array, "*shape b"]]:
         """Return the function that multiplies columns by the matrix.
 
-        It prepares the coefficients: for products in a loop, call it outside of the loop.
+        For products in a loop, call this before the loop, because it rearranges the coefficients.
         """
         apply = self.of_rimmed()
         return (lambda x: apply(x, x)) if self.is_diagonal else (lambda x: apply(x, self.rimmed(x)))
@@ -150,7 +150,7 @@ class Stencil(eqx.Module):
         distances, reach = _distances(self.coefficients.shape[1:])
         row = side_by_side(self.coefficients).reshape(-1, len(distances))
         nodes = len(row)
-        # Accelerators take an array per offset. Without the barrier, XLA would split the array for each product.
+        # Accelerators use one array per offset. Without the barrier, XLA would split the array for each product.
         apart = jax.lax.optimization_barrier(jnp.split(row, len(distances), axis=1)) if accelerators.at_hand() else ()
 
         def of_row(x: Float[Array, "*shape b"], padded: Float[Array, "padded b"]) -> Float[Array, "*shape b"]:
@@ -211,7 +211,7 @@ class StencilOperator(PatternedOperator):
         shape, coefficients = self.space.node_shape, list(self.coefficients)
 
         def product_with(row: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-            # The barrier makes the neighbours slices of an array. Without it XLA would compute the padding per node.
+            # With the barrier, the neighbours are slices of an array. Otherwise XLA would compute the padding per node.
             rimmed = jax.lax.optimization_barrier(with_rim(row, self.space.periodic))
             terms = zip(coefficients, neighbours(rimmed, len(shape)), strict=True)
             return reduce(add, (c * shifted for c, shifted in terms))

@@ -1,4 +1,4 @@
-"""Checkpoints of a fit, whose files are written completely or not at all."""
+"""Checkpoints of a fit. A file is written completely or not at all."""
 
 import dataclasses
 import hashlib
@@ -26,7 +26,7 @@ class Checkpoint:
 
 
 def fingerprint(*parts: Any) -> str:
-    """Return a hash of arrays and settings. Functions enter by name, which does not depend on the process."""
+    """Return a hash of arrays and settings. Functions enter by name, which is the same in every process."""
     digest = hashlib.blake2b(digest_size=16)
     for leaf in jax.tree.leaves(parts):
         text = getattr(leaf, "__qualname__", repr(leaf)).encode()

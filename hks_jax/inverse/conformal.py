@@ -36,13 +36,13 @@ class InnerProduct(eqx.Module):
 class Smoothing(InnerProduct):
     """The inner product ⟨x, y⟩ + ℓ²⟨∇x, ∇y⟩ of each component, where ℓ is the length below which steps are smooth.
 
-    It uses the mass matrix because a node at the boundary has half a cell, so its changes affect the data less.
+    The inner product has a mass matrix, because a node at the boundary has only half a cell and affects the data less.
     """
 
     pencil: Pencil  # stiffness and lumped mass of the flat metric
     factor: Factorisation | None  # the factorisation of K + M/ℓ²; None for ℓ = 0
     length: Float[Array, ""]  # ℓ, in coordinate units
-    cell: Float[Array, ""]  # the mean of the masses, by which they are divided
+    cell: Float[Array, ""]  # the mean mass of a node, which all masses are divided by
 
     def apply(self, values: Values) -> Values:
         """Return (M + ℓ²K) x divided by the mass of a cell."""
@@ -70,26 +70,25 @@ def smoothing(grid: Grid, length: float, dtype: np.dtype) -> Smoothing:
 _TOP = 0.03
 """The size of the eigenvalues of JᵀJ at the maximum of a(λt)², for weights that add up to one."""
 _POWER, _REACH = 3, 9.0
-"""In fits on 32² and 64² nodes with t ≥ 0.0045, (1 + λt/9)³ takes nearly the fewest steps of all such powers."""
+"""The preconditioner (1 + λt/9)³ took nearly the fewest steps of all such powers on 32² and 64² nodes."""
 
 
 # In the plane T = (1 + εu) I has the Laplacian (1 − εu) Δ and the area element (1 + εu) dx. By Duhamel's formula its
 # signature is h₀ (1 + εv) with h₀ = 1/(4πt). For u = exp(iξx) and x = t|ξ|²,
 #
-#     v = a(x) u,    a(x) = ∫₀¹ (1 + x (1 − s)²) exp(−x s (1 − s)) ds − 1:
-#
-# which is x/6 for small x, the contribution tK/3 of the curvature, and of order 1/x for large x. So JᵀJ is about Σₜ wₜ
-# a(tL)², where L is the Laplacian. Except for the first few, its eigenvalues decrease as those of L increase. On a grid
-# they decrease faster, because interpolation between nodes damps oscillations of the factor.
+#     v = a(x) u,    a(x) = ∫₀¹ (1 + x (1 − s)²) exp(−x s (1 − s)) ds − 1.
+# For small x, a(x) is x/6, the contribution tK/3 of the curvature; for large x it is of order 1/x. So JᵀJ is about
+# Σₜ wₜ a(tL)², where L is the Laplacian. Except for the first few, the eigenvalues of JᵀJ decrease as those of L
+# increase. On a grid they decrease faster, because interpolation between nodes damps oscillations of the factor.
 class ConformalInformation(eqx.Module):
-    """B½ (1 + L/λ₁)⁻³ B½ with the lumped mass B and a Laplacian L of the initial metric by differences along edges.
+    """The preconditioner B½ (1 + L/λ₁)⁻³ B½, where B is the lumped mass and L is a Laplacian of the initial metric.
 
-    Its inverse is a polynomial, which takes three products. Where JᵀJ is less than μ, JᵀJ + μB does not decrease
-    further. The value of λ₁ is so large that the same holds for the preconditioner.
+    The inverse is a polynomial of L, which takes three products with L. The eigenvalues of JᵀJ + μB are at least about
+    μ. So are the eigenvalues of the preconditioner, because λ₁ is large enough.
     """
 
-    unknowns: Nodal  # the factors at the nodes
-    root: Float[Array, "n 1"]  # the square roots of the masses, relative to that of a cell
+    unknowns: Nodal  # the conformal factors at the nodes
+    root: Float[Array, "n 1"]  # the square roots of the masses, relative to the mass of a cell
     weights: list[Float[Array, "..."]]  # the weights of the edges along each axis
     level: Float[Array, ""]  # λ₁ without damping
     largest: Float[Array, ""]  # a bound on the eigenvalues of L
@@ -112,7 +111,7 @@ def conformal_information(unknowns: Nodal, mass: InnerProduct, times: Float[Arra
     grid, nodes = unknowns.init.grid, unknowns.nodes.value
     relative = mass.apply(unknowns.start() + 1)
     at_nodes = jnp.zeros(grid.size, relative.dtype).at[nodes].set(relative[:, 0]).reshape(grid.shape)
-    # Values outside the domain are arbitrary, because no edge leads there.
+    # The metric outside the domain is arbitrary, because no edge leads there.
     metric = jnp.where(grid.inside[..., None, None], unknowns.init.domain_tensors, jnp.eye(grid.dimension))
     inverse = spd.inverse(metric)
     weights, rows = [], jnp.zeros_like(at_nodes)

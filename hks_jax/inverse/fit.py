@@ -41,9 +41,9 @@ def fit_metric(
     """Find a metric with a given signature.
 
     The fit minimises half the weighted mean square of the differences between predicted and given signature, plus the
-    penalties of the regularisers. Isometric metrics have the same signature, and high frequencies affect it little. So
-    the steps are damped, and smooth by default, and first change the directions that the data determine. The result
-    states how the fit ended; a fit that stalls or is interrupted raises no error.
+    penalties of the regularisers. Isometric metrics have the same signature, and high frequencies of a metric affect
+    its signature little. So the steps are damped and, by default, smooth. Steps first change the directions that the
+    data determine. The result states how the fit ended; a fit that stalls or is interrupted raises no error.
 
     Args:
         init: the initial metric: a field, or a grid for the flat metric. The fit keeps properties of the field that the
@@ -53,13 +53,13 @@ def fit_metric(
             ascending order, including zeros.
         times: (n_times,) times, or the energies of a wave kernel signature; None if the signature has neither.
         parametrisation: ``"log-euclidean"`` or ``"cholesky"`` (the whole tensor), ``"conformal"`` (e^u T₀),
-            ``"eigenvalues"`` (with the eigenvectors of `init`), ``"rotation"`` (with its eigenvalues), a
+            ``"eigenvalues"`` (with the eigenvectors of `init`), ``"rotation"`` (with the eigenvalues of `init`), a
             `Parametrisation`, or `Free` parameters of a function.
         data: the kind of signature, the measure of differences, and the weights and noise of entries.
         regularisers: penalties from `hks_jax.inverse`: `H1`, `TotalVariation`, `LogDeterminant`, `Prior`.
-        k: the number of eigenpairs. By default a share of 1e-6 of the heat trace at the smallest time lies beyond k by
-            Weyl's law, or k is maximal. It grows if the fit reaches a field of more volume. For a wave kernel signature
-            they reach to 2σ above the largest energy.
+        k: the number of eigenpairs. By default only a share of 1e-6 of the heat trace at the smallest time lies beyond
+            k, by Weyl's law, or k is maximal, and k grows if the fit reaches a field of more volume. For a wave kernel
+            signature the default eigenvalues reach to 2σ above the largest energy.
         boundary: the same as for `eigenpairs`.
         solver: the eigensolver; ``"auto"`` chooses one for many products with the same Jacobian.
         search: the settings of the optimisation and its stopping criteria.
@@ -121,7 +121,7 @@ def fit_metric(
         warn_of_accuracy(
             f"noise: the fit {result} with residuals of {(2 * misfit) ** 0.5:.2g}, above the noise {noise:.2g}. "
             "The fitted metric does not explain the target, and its differences from init may be artefacts. Use "
-            'another parametrisation, such as "log-euclidean", another init, weaker regularisers, or a larger noise='
+            'another parametrisation, such as "log-euclidean", another init, weaker regularisers, or a larger noise'
         )
     field, history, losses = unknowns.field(values), tuple(now.history), tuple(now.losses)
     return MetricFit(field, float(outcome.loss), misfit, left, history, result, values, problem, losses, noise)

@@ -20,26 +20,26 @@ _Options = dict[str, Any]
 _Tags = frozenset[object]
 
 _TIGHTER, _LONGER = 30, 3
-"""The factors of the accuracy and of the number of products in the linear systems of steps that may be the last."""
+"""The factors by which accuracy and products increase in the linear systems of steps that may be the last."""
 _ACCEPTED, _GOOD, _SHRINKING = 0.01, 0.5, 0.25
-"""The shares of the predicted reduction that accept a step and reduce damping; the step size's factor otherwise."""
+"""The shares of the predicted reduction that accept a step and reduce damping; the step size's factor on rejection."""
 _FREE = 0.01
-"""The largest share of damping in a step's curvature at which the step estimates the distance to the solution."""
+"""The largest share of damping in a step's curvature for which the step estimates the distance to the solution."""
 
 
 class _State(eqx.Module):
     """The state of the solver."""
 
-    first: Bool[Array, ""]  # whether no unknowns have been accepted
+    first: Bool[Array, ""]  # whether no unknowns have been accepted yet
     trial: Values  # the unknowns to be evaluated next
     finite: Bool[Array, ""]  # whether the last step is finite
-    step_size: Float[Array, ""]  # 1/μ, relative to the first
+    step_size: Float[Array, ""]  # 1/μ, relative to that of the first step
     linearised: Any  # residuals and Jacobian at the last accepted unknowns
-    aux: Any  # the auxiliary output of the residuals there
-    gradient: Values  # the gradient there
+    aux: Any  # the auxiliary output of the residuals at these unknowns
+    gradient: Values  # the gradient at these unknowns
     promised: Float[Array, ""]  # the linearised change of half the sum of squares by the last step
-    change: Float[Array, ""]  # the size of the last accepted step, in tolerances
-    damped: Float[Array, ""]  # xᵀBx of that step over its curvature; times μ, the share of damping
+    change: Float[Array, ""]  # the size of the last accepted step, relative to the tolerance
+    damped: Float[Array, ""]  # xᵀBx over the curvature of this step x; μ times this ratio is the share of damping
     tight: Bool[Array, ""]  # whether the linear systems are solved more exactly
     done: Bool[Array, ""]  # whether the descent has converged
 
@@ -58,20 +58,19 @@ def _empty(structure: Any) -> Any:
 class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _State]):
     """The default solver of `hks_jax.fit_metric`.
 
-    Its steps δ solve (JᵀJ + μB) δ = −Jᵀr, where B is an inner product of the unknowns and μ = damping / step size. The
-    conjugate gradients stop early, because far from the solution the linearisation error exceeds the algebraic error.
-    They return a descent direction whenever they stop.
+    The steps δ of the solver satisfy (JᵀJ + μB) δ = −Jᵀr, where B is an inner product of the unknowns and μ = damping /
+    step size. The conjugate gradients stop early, because far from the solution the linearisation error exceeds the
+    algebraic error. Whenever the iteration stops, it returns a descent direction.
 
-    The settings are arrays, so a step that is compiled for some values works for all.
+    The settings are arrays, so a compiled step works for all their values.
 
     Args:
-        tolerance: the relative and absolute change of the unknowns (root mean square) at which the solver stops; see
-            `Search`.
+        tolerance: the relative and absolute change of the unknowns (root mean square) at which the solver stops.
         damping: the damping μ of the first step, relative to the scale of the data.
         growth: the divisor of μ after a step that reduces the misfit as much as its linearisation predicts.
         inner_product: the inner product B, in whose norm steps are damped.
-        inner_tolerance: the reduction of the linear residual in a step; 30 times smaller if it may be the last.
-        inner_steps: the maximum number of products with JᵀJ in a step; three times larger if it may be the last.
+        inner_tolerance: the reduction of the linear residual in a step; 30 times smaller if the step may be the last.
+        inner_steps: the maximum number of products with JᵀJ in a step; three times larger if the step may be the last.
         preconditioner: the preconditioner of the conjugate gradients; B by default.
 
     Examples:
@@ -113,13 +112,14 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _State]):
         self.preconditioner = preconditioner or self.inner_product
 
     def accepted(self, y: Values, state: _State) -> _State:
-        """Return the state after the step from y to the trial; the next step computes the gradient there."""
+        """Return the state after the step from y to the trial; the next step computes the gradient at the trial."""
         step = state.trial - y
         change = optx.rms_norm(step / (self.rtol * (1 + jnp.abs(state.trial))))
         moved, curvature = change > 0, -jnp.vdot(step, state.gradient)
         damped = jnp.vdot(step, self.inner_product.apply(step)) / jnp.where(curvature > 0, curvature, 1)
         damped = jnp.where(moved & (curvature > 0), damped, jnp.inf)
-        # The distance to the solution is the step or, if larger, the rest of a geometric series with the last two.
+        # The distance to the solution is estimated by the step or, if larger, by the rest of the geometric series that
+        # begins with the last two steps.
         ratio = change / state.change
         settled = moved & (ratio < 1) & (change * jnp.maximum(1, ratio / (1 - ratio)) < 1)
         # The next step may be the last: it is below the tolerance if the steps keep shrinking at this rate.
@@ -176,8 +176,8 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _State]):
     ) -> tuple[Values, _State, Any]:
         """Accept or reject the trial, and choose the next; return the unknowns and the auxiliary output.
 
-        Choosing the next trial is most of the work. It is skipped if the option ``"enough"``, a function of that
-        output, is true.
+        Choosing the next trial is most of the work. This work is skipped if the function in the option ``"enough"`` is
+        true of the auxiliary output.
         """
         linearised, aux = _linearise(fn, state.trial, args)
         # Traces are compared by identity, so the trace of the state is used in all states.

@@ -1,5 +1,6 @@
 """The information of data about the unknowns of a fit: the spectrum of JᵀJ, resolution and uncertainty."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -31,11 +32,10 @@ class Identifiability(eqx.Module):
         directions: (n, *values) their eigenvectors, normalised.
         weak_strengths: (n_weak,) upper estimates of the smallest eigenvalues in ascending order.
         weak_directions: (n_weak, *values) the directions that the data determine least.
-        resolution: (nodes,) a lower bound from the n directions on the share of each node's unknowns that the data
-            determine.
+        resolution: (nodes,) a lower bound, from n directions, on the share of each node's unknowns that data determine.
         deviation: (nodes,) the posterior standard deviation of each node's unknowns (root mean square) from the n
-            directions. To first order it is an upper bound on the exact one under a white prior, which means
-            independent unknowns with standard deviation τ. A prior that couples neighbours reduces it.
+            directions. To first order it is an upper bound on the exact deviation under a white prior, that is, for
+            independent unknowns with standard deviation τ. A prior that couples neighbours reduces the deviation.
         effective: the number of unknowns that the data determine, Σ s²/(s² + σ²/τ²) over the n directions.
         noise: the standard deviation σ of the residuals.
         prior: the standard deviation τ of the prior.
@@ -72,8 +72,8 @@ def identifiability(
     """Find the directions that the data of a fit determine, from products with J and Jᵀ.
 
     The strongest directions result from randomised subspace iteration on JᵀJ (Halko, Martinsson and Tropp 2011). The
-    weakest result from subspace iteration on the complement with Chebyshev polynomials that damp strong directions.
-    Weak directions include isometries that preserve the observation, checkerboards, and changes far from observations.
+    weakest directions result from subspace iteration with Chebyshev polynomials that damp strong directions. Weak
+    directions include isometries that preserve the observation, checkerboards, and changes far from observations.
 
     Args:
         fit: the result of `fit_metric`, or its problem.
@@ -106,30 +106,31 @@ def identifiability(
     require_number("prior", prior)
     require_count("iterations", iterations)
     keys = jax.random.split(jax.random.key(seed))
-    start = jax.random.normal(keys[0], (min(n + 8, total), *values.shape), values.dtype)
+    start = jax.random.normal(keys[0], (min(n + 8, total), total), values.dtype)
     strengths, directions = _strongest(problem, values, start, iterations)
-    weak_start = jax.random.normal(keys[1], (min(n_weak + 4, total), *values.shape), values.dtype)
+    weak_start = jax.random.normal(keys[1], (min(n_weak + 4, total), total), values.dtype)
     weak, weak_directions = _weakest(problem, values, weak_start, strengths[0], 2 * iterations)
 
     # The weights of m entries add up to one, so weighted residuals have the mean variance σ²/m.
     variance = noise**2 / problem.observation.target.size
-    strengths, directions = strengths[:n], directions[:n]
+    strengths, directions = strengths[:n], directions[:n].reshape(n, *values.shape)
+    weak_directions = weak_directions[:n_weak].reshape(n_weak, *values.shape)
     share = strengths / (strengths + variance / prior**2)
     squares = directions.reshape(n, len(values), -1) ** 2
     resolution = jnp.einsum("n,nxc->x", share, squares) / squares.shape[2]
     deviation = prior * jnp.sqrt(jnp.maximum(1 - resolution, 0))
-    found = strengths, directions, weak[:n_weak], weak_directions[:n_weak], resolution, deviation
+    found = strengths, directions, weak[:n_weak], weak_directions, resolution, deviation
     return Identifiability(*found, jnp.sum(share), noise, prior)
 
 
 def _information(problem: Problem, values: Values) -> Any:
-    """Return a function that multiplies each direction of a batch by JᵀJ of the data's residuals."""
+    """Return a function that multiplies each flat direction of a batch by JᵀJ of the data's residuals."""
 
-    def data(values: Values) -> Array:
-        return problem.observation.residuals(problem.pairs(values))
+    def data(flat: Array) -> Array:
+        return problem.observation.residuals(problem.pairs(flat.reshape(values.shape)))
 
-    _, product = jax.linearize(data, values)
-    transposed = jax.linear_transpose(product, values)
+    _, product = jax.linearize(data, values.ravel())
+    transposed = jax.linear_transpose(product, values.ravel())
     return lambda batch: jax.lax.map(lambda x: transposed(product(x))[0], batch)
 
 
@@ -137,7 +138,7 @@ def _information(problem: Problem, values: Values) -> Any:
 def _strongest(problem: Problem, values: Values, start: Array, iterations: int) -> tuple[Array, Array]:
     product = _information(problem, values)
     block = jax.lax.fori_loop(0, iterations, lambda _, block: _orthonormal(product(block)), _orthonormal(start))
-    values, vectors = _ritz(block, product(block))
+    values, vectors = _ritz(block, product)
     return values[::-1], vectors[::-1]
 
 
@@ -155,19 +156,17 @@ def _weakest(problem: Problem, values: Values, start: Array, top: Float[Array, "
             return (product(x) - centre * x) / half
 
         block, _, _ = chebyshev_recurrence(scaled, block, degree)
-        block = _orthonormal(block)
-        return _ritz(block, product(block))
+        return _ritz(_orthonormal(block), product)
 
     return jax.lax.fori_loop(0, _ROUNDS, improve, (jnp.full(len(start), 0.2 * top), _orthonormal(start)))
 
 
-def _orthonormal(block: Float[Array, "n *values"]) -> Float[Array, "n *values"]:
-    return lapack.orthonormal_columns(block.reshape(len(block), -1).T).T.reshape(block.shape)
+def _orthonormal(block: Float[Array, "n total"]) -> Float[Array, "n total"]:
+    return lapack.orthonormal_columns(block.T).T
 
 
-def _ritz(block: Array, image: Array) -> tuple[Array, Array]:
+def _ritz(block: Float[Array, "n total"], product: Callable[[Array], Array]) -> tuple[Array, Array]:
     """Return Ritz values in ascending order and Ritz vectors in the span of orthonormal directions."""
-    flat, images = block.reshape(len(block), -1), image.reshape(len(block), -1)
-    projected = jnp.matmul(flat, images.T, precision="highest")
+    projected = jnp.matmul(block, product(block).T, precision="highest")
     values, mix = lapack.eigh((projected + projected.T) / 2)
-    return values, jnp.matmul(mix.T, flat, precision="highest").reshape(block.shape)
+    return values, jnp.matmul(mix.T, block, precision="highest")

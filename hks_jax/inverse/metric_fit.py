@@ -34,7 +34,7 @@ class Step:
     """One step of a fit.
 
     Attributes:
-        step: its number, where 0 belongs to the initial unknowns. Solvers of optimistix report only accepted steps.
+        step: the number of the step; 0 belongs to the initial unknowns. Optimistix reports only accepted steps.
         loss: half the weighted mean square of the residuals, plus the penalties.
         misfit: the data's part of the loss.
         gradient: the norm of the loss's gradient; NaN for least squares solvers of optimistix, which do not compute it.
@@ -85,15 +85,14 @@ class MetricFit:
         field: the fitted metric.
         loss: half the weighted mean square of the residuals, plus the penalties.
         misfit: the data's part of the loss.
-        truncation_misfit: an estimate of the misfit between the signatures of the metric by k and by all eigenpairs; 0
-            for signatures that k pairs define.
+        truncation_misfit: an estimate of the misfit between the metric's signatures from k and from all eigenpairs; 0
+            for signatures that the k pairs define.
         history: one entry for each step.
         result: a key of `RESULTS`, whose values explain the keys.
         values: the unknowns of the parametrisation.
         problem: the least squares problem, for `identifiability` and for custom fits.
         losses: the loss of each start.
-        noise: the stated standard deviation of the residuals, or the one that follows from the target's; otherwise
-            None.
+        noise: the standard deviation of the residuals, as stated or from the target's deviation; otherwise None.
     """
 
     field: TensorField
@@ -126,13 +125,13 @@ class MetricFit:
     def uncertainty(self, prior: float = 1.0, noise: float | None = None, draws: int = 32, seed: int = 0) -> Posterior:
         """Compute first-order error bars of the fitted metric by Laplace's approximation.
 
-        The posterior of the unknowns has the covariance (JᵀΣ⁻¹J + R)⁻¹: J is the Jacobian of the data, Σ is the noise
-        with the weights of the fit, and R is the Hessian of the penalties and a white prior. Each draw solves one
-        linear system by conjugate gradients.
+        The posterior of the unknowns has the covariance (JᵀΣ⁻¹J + R)⁻¹: J is the Jacobian of the data, Σ is the
+        covariance of the noise with the weights of the fit, and R is the Hessian of the penalties and a white prior.
+        Each draw solves one linear system by conjugate gradients.
 
         Args:
             prior: the standard deviation of every unknown without data, in the parametrisation's units.
-            noise: the standard deviation of the residuals, by default that of the fit.
+            noise: the standard deviation of the residuals, by default `MetricFit.noise`.
             draws: the number of draws; the relative error of a deviation is 1/√(2·draws).
             seed: the seed of the draws.
 
@@ -145,7 +144,7 @@ class MetricFit:
         require_number("noise", noise)
         require_number("prior", prior)
         require_count("draws", draws)
-        # The weights add up to one over m entries: a residual of deviation σ has σ²/m after weighting, in the mean.
+        # The weights of m entries add up to one, so weighted residuals have the mean variance σ²/m.
         scale = math.sqrt(self.problem.observation.target.size) / noise
         dtype, keys = self.values.dtype, jax.random.split(jax.random.key(seed), draws)
         numbers = jnp.asarray(scale, dtype), jnp.asarray(prior, dtype)

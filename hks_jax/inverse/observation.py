@@ -40,13 +40,13 @@ class Data:
             predicted and target values to residuals.
         weights: numbers ≥ 0 that broadcast to the target's shape; 0 at unobserved entries, where the target may be NaN.
         noise: the standard deviation of the residuals (0.01 for 1 % under ``"log"``). The fit stops when the misfit
-            reaches this level (the discrepancy principle), which regularises it.
+            reaches this level (the discrepancy principle), which regularises the fit.
         deviation: the standard deviation of the target's noise in the target's unit, broadcast to its shape, for
-            example from `hks_jax.uncertainty`. The weights are multiplied by its inverse square, and by default `noise`
-            follows from it. Correlations of the noise are ignored.
+            example from `hks_jax.uncertainty`. The weights are divided by the square of the deviation, and by default
+            `noise` follows from the deviation. Correlations of the noise are ignored.
 
     Raises:
-        ValueError: if the signature or loss is unknown, if the noise is not positive, or if a function as loss has a
+        ValueError: if the signature or loss is unknown, if the noise is not positive, or if a loss function has a
             deviation.
 
     Examples:
@@ -80,7 +80,7 @@ class Observation(eqx.Module):
     """The observed entries of a target."""
 
     target: Float[Array, " m"]  # the observed values
-    root_weights: Float[Array, " m"]  # the square roots of their weights, which add up to one
+    root_weights: Float[Array, " m"]  # the square roots of their weights; the weights add up to one
     times: Float[Array, " n_times"] | None  # the times, energies, or None
     signature: Signature  # the kind of signature
     shape: tuple[int, ...] = eqx.field(static=True)  # the shape of the whole target
@@ -90,7 +90,7 @@ class Observation(eqx.Module):
     def predict(self, pairs: Eigenpairs) -> Array:
         """Return the whole signature."""
         values = self.signature.predict(pairs, self.times)
-        return values[: self.shape[0]] if self.signature.lowest else values  # there may be more pairs
+        return values[: self.shape[0]] if self.signature.lowest else values  # more pairs may have been computed
 
     def pairs_needed(self, k: int | None, pencil: AnyPencil, field: TensorField) -> int:
         """Return the number of eigenpairs to compute: k, or enough for the observed times."""
@@ -98,18 +98,18 @@ class Observation(eqx.Module):
         return self.shape[0] if self.signature.lowest else self.signature.pairs_needed(k, times, pencil, field)
 
     def residuals(self, pairs: Eigenpairs) -> Float[Array, " m"]:
-        """Return the residuals. The misfit is half their sum of squares."""
+        """Return the residuals, whose half sum of squares is the misfit."""
         return self.compare(self.predict(pairs))
 
     def compare(self, predicted: Array) -> Float[Array, " m"]:
-        """Return the residuals of a whole signature."""
+        """Return the residuals of a signature with the target's shape."""
         return self.root_weights * self.loss(predicted.reshape(-1)[self.entries.value], self.target)
 
     def truncation_misfit(self, pairs: Eigenpairs) -> Float[Array, ""]:
-        """Estimate the misfit between the signatures of the metric by k and by all pairs.
+        """Estimate the misfit between the metric's signatures from k and from all eigenpairs.
 
-        It is half the weighted sum of squares of the missing pairs' contributions to the residuals, and zero for
-        signatures that k pairs define.
+        The estimate is half the weighted sum of squares of the missing pairs' contributions to the residuals, and zero
+        for signatures that the k pairs define.
         """
         if self.signature.left_out is None:
             return jnp.zeros(())
@@ -155,13 +155,13 @@ def observe(target: Any, times: Any, data: Data, space: FunctionSpace, dtype: An
     expected = None if times is None else (times.size, *nodes)
     if (expected is not None and values.shape != expected) or (signature.lowest and values.ndim != 1):
         what = "(n_times, *grid.shape)" if signature.at_nodes else "(n_times,)"
-        wanted = "(m,), the lowest ones ascending" if expected is None else f"{what} = {expected}"
+        wanted = "(m,), the lowest eigenvalues in ascending order" if expected is None else f"{what} = {expected}"
         raise ValueError(f"target: got shape {values.shape}; expected {wanted}")
 
     weights, noise = _weights(values, data)
     weights = weights * (space.free if signature.at_nodes else 1)
     if signature.lowest:
-        weights = weights * (np.arange(values.size) >= space.n_null)  # zero for every metric
+        weights = weights * (np.arange(values.size) >= space.n_null)  # null eigenvalues are zero for every metric
     used = weights > 0
     if not used.any():
         raise ValueError("weights: got only zeros inside the domain; expected a positive weight at some entry")

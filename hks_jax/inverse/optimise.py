@@ -39,7 +39,7 @@ _objective = eqx.filter_custom_jvp(_half_squares)
 
 @_objective.def_jvp
 def _objective_jvp(primals: tuple, tangents: tuple) -> tuple:
-    """Compute the gradient together with the value, so that it is reported; all solvers need it anyway."""
+    """Compute the gradient with the value, so that its norm can be reported; all minimisers need the gradient."""
     (values, problem), (direction, _) = primals, tangents
     (value, outcome), gradient = jax.value_and_grad(_half_squares, has_aux=True)(values, problem)
     outcome = outcome._replace(gradient=jnp.linalg.norm(jnp.ravel(gradient)))
@@ -84,7 +84,7 @@ class Reached(NamedTuple):
     """The end of a search."""
 
     values: Values  # the unknowns
-    outcome: Outcome | None  # loss and misfit there; None where they are not known
+    outcome: Outcome | None  # loss and misfit at these unknowns; None if not computed
     result: str  # one of the keys of `metric_fit.RESULTS`
 
     @property

@@ -22,10 +22,10 @@ from hks_jax.inverse.unknowns import Unknowns, Values
 from hks_jax.signatures.truncation import resolving
 
 _NEAR = 0.1
-"""The share of truncation in a misfit above which a warning is issued; it is a third of the residuals."""
+"""The share of truncation in a misfit above which a warning is issued, about a third of the residuals."""
 _ENOUGH = 1e-5
-"""The tolerance of the solver's derivative from which single precision suffices. On 64² nodes single
-precision has errors of 1e-6 in J and 1e-5 to 3e-5 in Jᵀ; this tolerance has 5e-6 and 5e-5 for nonsmooth fields."""
+"""The least tolerance of the solver's derivative for which single precision suffices. On 64² nodes single precision
+causes errors of 1e-6 in J and 1e-5 to 3e-5 in Jᵀ; this tolerance causes 5e-6 and 5e-5 for nonsmooth fields."""
 
 
 class Outcome(NamedTuple):
@@ -45,7 +45,7 @@ class Problem(eqx.Module):
     unknowns: Unknowns  # the parameters that vary
     observation: Observation  # the data
     regularisers: tuple[Regulariser, ...]  # penalties
-    k: int = eqx.field(static=True)  # eigenpairs
+    k: int = eqx.field(static=True)  # the number of eigenpairs
     boundary: Any = eqx.field(static=True)  # boundary conditions
     solver: str | Eigensolver = eqx.field(static=True)  # eigensolver
 
@@ -58,7 +58,7 @@ class Problem(eqx.Module):
         return eigenpairs(field, self.k, self.boundary, self.solver, multiplet="complete")
 
     def evaluate(self, values: Values) -> tuple[Float[Array, " m"], Float[Array, " r"], Outcome]:
-        """Return the residuals of the data, those of the penalties, and the outcome."""
+        """Return the residuals of the data, the residuals of the penalties, and the outcome."""
         field = self.unknowns.field(values)
         pairs = self._pairs_of(field)
         data = _residuals_of(self.observation, pairs, self.solver)
@@ -72,14 +72,14 @@ class Problem(eqx.Module):
         return data, penalty, jax.lax.stop_gradient(outcome)
 
     def residuals(self, values: Values) -> tuple[Float[Array, " m"], Float[Array, " r"]]:
-        """Return the residuals of the data and those of the penalties."""
+        """Return the residuals of the data and of the penalties."""
         return self.evaluate(values)[:2]
 
 
-# A heat signature is at least that of the constants. Other signatures, and heat signatures without constant
-# eigenfunctions, may underflow in single precision, and derivatives of logarithms divide by them.
+# A heat signature is at least the contribution of the constant eigenfunctions. Other signatures, and heat signatures
+# without constant eigenfunctions, may underflow in single precision, and derivatives of logarithms divide by them.
 def _residuals_of(observation: Observation, pairs: Eigenpairs, solver: str | Eigensolver) -> Float[Array, " m"]:
-    """Return the residuals. Their derivative is in single precision if the solver's derivative is no more accurate."""
+    """Return the residuals, with a derivative in single precision if the solver's derivative is no more accurate."""
     rough = isinstance(solver, Eigensolver) and solver.adjoint.tolerance >= _ENOUGH
     bounded = observation.signature.left_out is not None and pairs.n_null > 0
     return (_rough if rough and bounded else Observation.residuals)(observation, pairs)
@@ -113,7 +113,7 @@ def truncation_shows(misfit: float, left: float) -> bool:
 
 
 def more_pairs(problem: Problem, values: Values) -> int:
-    """Return a larger number of pairs, for a field for which the pairs of a problem are too few."""
+    """Return a larger number of pairs, for a field that needs more than the problem has."""
     field = problem.unknowns.field(values)
     pencil = assemble(field, problem.boundary)
     smallest = float(np.min(problem.observation.observed_times))

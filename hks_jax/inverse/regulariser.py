@@ -1,6 +1,6 @@
-"""Regularisers, which select a solution of a fit that the data do not determine.
+"""Regularisers, which select one of several solutions that explain the data of a fit.
 
-Each penalty is half a weighted mean of squares over the domain. Its residuals serve least squares solvers.
+Each penalty is half a weighted mean of squares over the domain, whose residuals enter the least squares problem.
 """
 
 from abc import abstractmethod
@@ -29,7 +29,7 @@ class Regulariser(eqx.Module):
         require_number("weight", self.weight, inclusive=True)
 
     def residuals(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, " m"]:
-        """Return the residuals. The penalty is half their sum of squares."""
+        """Return the residuals, whose half sum of squares is the penalty."""
         deviations = self.deviations(unknowns, values, field)
         return jnp.sqrt(self.weight / int(field.grid.inside.sum())) * deviations.ravel()
 

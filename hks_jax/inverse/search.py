@@ -33,14 +33,13 @@ class Search:
         smoothness: the length, in coordinate units, below which Gauss–Newton steps are smooth, or 0 for steps without
             smoothing. The default is a tenth of the domain, and 0 for ``"conformal"`` without noise.
         tolerance: a fit has converged when the unknowns u change by less than this, relative to 1 + |u| (root mean
-            square). Both the last step and the sum of future steps, if the last two begin a geometric series, must
-            satisfy this. Linear systems of steps that may be the last are solved 30 times more exactly with three times
-            as many products. Directions that the products do not reach are ignored; `identifiability` finds them.
-            Solvers of optimistix test only the last step.
+            square). Both the last step and the sum of future steps must satisfy this criterion; a geometric series
+            predicts future steps. Linear systems of steps that may be the last are solved 30 times more exactly with
+            three times as many products. Directions that the products do not reach are ignored; `identifiability` finds
+            them. Solvers of optimistix test only the last step.
         max_steps: the maximum number of steps in each stage.
-        continuation: the number of stages. The first fits only the largest times, the last fits all times.
-        starts: the number of starts, first from the initial field and then from random smooth changes of it. The best
-            is returned.
+        continuation: the number of stages. The first stage fits only the largest times, the last stage fits all times.
+        starts: the number of starts, first from the initial field, then from random smooth changes. The best is kept.
         spread: the root mean square of the random changes, in the parameters' units.
         seed: the seed of the random changes.
 
@@ -93,7 +92,7 @@ _EARLY = 100.0
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """One search that starts from the unknowns `first`."""
+    """One search for unknowns, which starts from the unknowns `first`."""
 
     search: Search  # the settings
     first: Values  # the unknowns of the initial field
@@ -105,23 +104,23 @@ class Run:
     mark: str  # a hash of data and settings
     clock: float  # the time when the fit began, by `time.perf_counter`
 
-    def told(
-        self, number: int, told: tuple[float, float, float], accepted: bool, values: Values, step_size: float
+    def record(
+        self, number: int, numbers: tuple[float, float, float], accepted: bool, values: Values, step_size: float
     ) -> None:
         """Record and report a step of a stage with its number, loss, misfit, gradient and acceptance."""
         now, seconds = self.now, time.perf_counter() - self.clock
         now.values, now.step_size = values, step_size
-        now.history.append(Step(number, *told, accepted, seconds, now.stage, now.start))
+        now.history.append(Step(number, *numbers, accepted, seconds, now.stage, now.start))
         if self.progress is not None:
             self.progress(now.history[-1])
         if self.path is not None:
             save(self.path, self.mark, now)
 
     def solve(self, problem: Problem, values: Values, tolerances: float = 1.0, step_size: float = 1.0) -> Reached:
-        """Solve one problem from given unknowns; a factor multiplies tolerances, the step size divides the damping."""
+        """Solve a problem from given unknowns; `tolerances` multiplies the tolerance, `step_size` divides damping."""
         method, tolerance = self.search.optimiser, tolerances * self.search.tolerance
         if method == "gauss-newton":
-            # Noise requires small steps, because the misfit must not fall far below it.
+            # Noise requires small steps, because the misfit must not fall far below the noise.
             damping, growth = (1e-4, 10.0) if self.noise is None else (1e-2, 3.0)
             known, preconditioner = self.inner_product, self._preconditioner(problem)
             method = GaussNewton(tolerance, damping / step_size, growth, known, preconditioner=preconditioner)
@@ -129,7 +128,7 @@ class Run:
             traced = jnp.asarray(tolerance)  # a static value would cause a compilation for every stage
             method = OPTIMISERS[method](traced, traced, optx.rms_norm)
         with jax.debug_nans(False):  # values that were not computed are NaN
-            return optimise(problem, values, method, self.noise, self.search.max_steps, self.told)
+            return optimise(problem, values, method, self.noise, self.search.max_steps, self.record)
 
     def _preconditioner(self, problem: Problem) -> InnerProduct | ConformalInformation:
         """Return an approximation of JᵀJ if one is known, otherwise the inner product."""
@@ -156,7 +155,7 @@ class Run:
         return reached
 
     def from_starts(self, problems: Sequence[Problem]) -> Reached:
-        """Return the best of several starts, from the recorded state and from random changes of the first unknowns."""
+        """Return the best result of several starts: the recorded state, and random changes of the first unknowns."""
         now, start = self.now, self.now.start
         where = jnp.asarray(now.values), now.stage, now.step_size
         if now.stage == len(problems):  # the fit already uses more eigenpairs, so all starts are complete

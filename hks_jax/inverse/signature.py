@@ -32,9 +32,9 @@ class Signature(eqx.Module):
         function: a function of the eigenpairs and, if the signature has them, of times or energies and sigma.
         symbol: the symbol of a further argument: ``"t"`` for times, ``"e"`` for energies, empty for none.
         at_nodes: whether the signature has a value at each node.
-        left_out: a function of eigenpairs and times that estimates the share beyond the eigenpairs, or None if the
-            computed pairs define the signature.
-        lowest: whether the signature consists of the lowest eigenvalues, as many as in the target.
+        left_out: a function of eigenpairs and times that estimates the share of the signature beyond the eigenpairs, or
+            None if the computed pairs define the signature.
+        lowest: whether the signature consists of the lowest eigenvalues; their number is the size of the target.
         sigma: the width of wave kernels.
     """
 
@@ -110,7 +110,7 @@ def pairs_for(times: Any, pencil: AnyPencil, field: TensorField) -> int:
 
 
 def unknowns_of(pencil: AnyPencil) -> int:
-    """Return the number of eigenpairs of a pencil."""
+    """Return the number of unknowns of a pencil, which is the number of its eigenpairs."""
     return sum(part.space.n_dof for part in pencil.parts)
 
 

@@ -2,7 +2,6 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -17,7 +16,6 @@ from hks_jax.checks import require_real
 from hks_jax.domain import spd
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.linear.dense_eigh import differentiable_eigh
 
 Values = Float[Array, "..."]
 Tensors = Float[Array, "n d d"]
@@ -38,7 +36,7 @@ def flat_field(grid: Grid, dtype: Any = float) -> TensorField:
 
 
 class Parametrisation(eqx.Module):
-    """A map from a few parameters at each node, and the initial tensor there, to a tensor.
+    """A map from a few parameters and the initial tensor at each node to a tensor.
 
     Attributes:
         start: maps the initial tensors (n, d, d) to their parameters (n, c).
@@ -52,7 +50,7 @@ class Parametrisation(eqx.Module):
 
 
 def _logarithm(base: Tensors) -> Parameters:
-    """Return the diagonal of log T and √2 times the entries below it, whose Euclidean norm is the Frobenius norm."""
+    """Return the diagonal of log T and √2 times the entries below it; their Euclidean norm is the Frobenius norm."""
     logarithm = spd.log(base)
     rows, columns = np.tril_indices(base.shape[-1], -1)
     diagonal = jnp.diagonal(logarithm, axis1=1, axis2=2)
@@ -88,7 +86,7 @@ def _scaled(parameters: Parameters, base: Tensors) -> Tensors:
 
 
 def _stretched(parameters: Parameters, base: Tensors) -> Tensors:
-    values, vectors = jax.vmap(partial(differentiable_eigh, None))(base)
+    values, vectors = spd.eigh(base)
     return jnp.einsum("nia,na,nja->nij", vectors, jnp.exp(parameters) * values, vectors, precision="highest")
 
 
@@ -114,7 +112,7 @@ def _rotation(vector: Float[Array, "n 3"]) -> Tensors:
 
 
 def _zeros(count: Callable[[int], int]) -> Callable[[Tensors], Parameters]:
-    """Return a function that maps initial tensors to zeros, whose number depends on the dimension."""
+    """Return a function that maps initial tensors (n, d, d) to zeros (n, count(d))."""
     return lambda base: jnp.zeros((len(base), count(base.shape[-1])), base.dtype)
 
 
@@ -152,7 +150,7 @@ class Nodal(Unknowns):
 
     parametrisation: Parametrisation  # the map from parameters to tensors
     init: TensorField  # the initial field, which does not change outside the domain
-    # The flat indices of the domain's nodes, converted from the domain (*shape).
+    # The flat indices of the domain's nodes; the constructor takes the domain, bool (*shape).
     nodes: Any = eqx.field(static=True, converter=lambda domain: StaticArray(np.flatnonzero(domain)))
 
     @property
@@ -192,7 +190,7 @@ class Free(Unknowns):
     Attributes:
         function: maps the parameters to a `TensorField`, or to tensors on the grid of the initial field.
         parameters: the initial parameters, any pytree of floating point arrays.
-        init: the initial field with grid and interpolation, which the fit sets.
+        init: the initial field, which gives tensors a grid and an interpolation; `fit_metric` sets it.
 
     Examples:
         >>> scaled = hj.inverse.Free(lambda s: s * field.tensors, jnp.array(1.1))

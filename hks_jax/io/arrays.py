@@ -14,14 +14,14 @@ from hks_jax.io.volume import Format, TensorVolume, describe_tensors
 from hks_jax.storage import load_npy, load_npz, write_npz
 
 
-def _read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, None]:
-    """Return the array of an npy, or the array ``mask`` of an npz, and None in place of an affine."""
+def _read_image(name: str) -> tuple[np.ndarray, None, str]:
+    """Return the array of an npy, or the array ``mask`` of an npz, without an affine and a unit."""
     if name.lower().endswith(".npy"):
-        return load_npy(name), None
+        return load_npy(name), None, ""
     arrays = load_npz(name)
     if "mask" not in arrays:
         raise ValueError(f"{name}: got the arrays {', '.join(sorted(arrays)) or 'none'}; expected an array 'mask'")
-    return arrays["mask"], None
+    return arrays["mask"], None, ""
 
 
 def _read_tensors(
@@ -61,7 +61,7 @@ def _read_tensors(
 
 
 def volume_of(name: str, arrays: Mapping[str, Any], tensors: Float[np.ndarray, "..."], **about: Any) -> TensorVolume:
-    """Return a volume at the position that `place_of` wrote, by default with a spacing of 1 and the origin 0."""
+    """Return a volume of `tensors` at the position in `arrays` (see `place_of`), by default spacing 1 and origin 0."""
     mask, affine, d = arrays.get("mask"), arrays.get("affine"), tensors.shape[-1] if tensors.ndim else 0
     return TensorVolume(
         tensors,

@@ -19,11 +19,11 @@ from hks_jax.storage import reading
 _TRIANGLES = b"\xff\xff\xfe"
 """The first bytes of FreeSurfer's files of triangles."""
 _AXES = 6
-"""The largest number of axes of an array in GIFTI."""
+"""The largest number of axes that GIFTI allows for an array."""
 
 
 def is_freesurfer(path: Path) -> bool:
-    """Return whether a file begins as FreeSurfer's surfaces do."""
+    """Return whether a file begins with the first bytes of FreeSurfer's surfaces."""
     if not path.is_file():
         return False
     with open(path, "rb") as stream:
@@ -37,7 +37,7 @@ _SCANNER = (1, 2)
 
 
 def load_freesurfer(path: Path, in_space: bool = False) -> Loaded:
-    """Load a FreeSurfer surface, with coordinates in mm as in the file or, if `in_space`, the scanner's."""
+    """Load a FreeSurfer surface with the coordinates in the file or, if `in_space`, with scanner coordinates, in mm."""
     library = optional("nibabel")
     with reading(path, "a readable FreeSurfer surface"):
         content = path.read_bytes()
@@ -56,27 +56,27 @@ def load_freesurfer(path: Path, in_space: bool = False) -> Loaded:
             name: np.array(numbers.split(), np.float64)
             for name, numbers in re.findall(rb"([xyzc]ras)\s*=([-+.\deE \t]+)", content[end:])
         }
-        vertices = _from_own_axes(path, vertices, [told.get(name + b"ras") for name in (b"x", b"y", b"z", b"c")])
+        axes = [told.get(name + b"ras", np.zeros(0)) for name in (b"x", b"y", b"z", b"c")]
+        vertices = _from_own_axes(path, vertices, axes)
     return Loaded(vertices, np.asarray(faces, np.int64), {})
 
 
-def _from_own_axes(path: Path, vertices: np.ndarray, axes: list[np.ndarray | None]) -> np.ndarray:
+def _from_own_axes(path: Path, vertices: np.ndarray, axes: list[np.ndarray]) -> np.ndarray:
     """Return scanner coordinates, from FreeSurfer's coordinates and its volume's axes x̂, ŷ, ẑ and centre c."""
-    known = [axis for axis in axes if axis is not None and axis.shape == (3,)]
-    if len(known) < 4:
+    if any(axis.shape != (3,) or not np.isfinite(axis).all() for axis in axes):
         raise ValueError(
             f"{path}: the file does not state the position of its volume (x_ras … c_ras), which scanner coordinates "
             "need. Convert the file by mris_convert --to-scanner"
         )
-    return vertices @ (np.stack(known[:3], axis=1) @ _OWN_AXES.T).T + known[3]
+    return vertices @ (np.stack(axes[:3], axis=1) @ _OWN_AXES.T).T + axes[3]
 
 
 def load_gifti(path: Path, in_space: bool = False) -> Loaded:
-    """Load a GIFTI surface, with coordinates as in the file or, if `in_space`, the scanner's."""
+    """Load a GIFTI surface with the coordinates in the file or, if `in_space`, with scanner coordinates."""
     library = optional("nibabel")
     with reading(path, "a readable GIFTI surface"):
         content = gzip.decompress(path.read_bytes()) if path.suffix.lower() == ".gz" else path.read_bytes()
-        # nibabel loops over the declared number of axes, however large.
+        # nibabel would loop over any declared number of axes, such as a billion.
         axes = [int(n) for n in re.findall(rb"Dimensionality\s*=\s*[\"'](\d+)", content)]
         if max(axes, default=0) > _AXES:
             raise ValueError(f"got an array of {max(axes)} axes; expected at most {_AXES}")
@@ -107,4 +107,4 @@ def _in_space(path: Path, vertices: np.ndarray, points: Any) -> np.ndarray:
     if "VolGeomC_R" not in told:
         return vertices
     axes = [np.array([float(told.get(f"VolGeom{a}_{b}", "nan")) for b in "RAS"]) for a in "XYZC"]
-    return _from_own_axes(path, vertices, [axis if np.isfinite(axis).all() else None for axis in axes])
+    return _from_own_axes(path, vertices, axes)

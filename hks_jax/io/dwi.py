@@ -5,7 +5,6 @@ import os
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -23,7 +22,7 @@ from hks_jax.storage import existing, reading
 _LENGTH = 0.05
 """The largest difference of a direction's length from 1 that is attributed to rounding."""
 _SEEN = 0.01
-"""The least ratio 1 − h of a residual's variance to the variance of the noise for which the residual is used."""
+"""A residual is used if the ratio 1 − h of its variance to the variance of the noise is above this value."""
 
 
 class ExampleBrain(NamedTuple):
@@ -36,7 +35,7 @@ class ExampleBrain(NamedTuple):
 
 
 def find_example_brain() -> ExampleBrain | None:
-    """Return the files of the brain in the PyPI wheel ``mdt`` (104 × 104 × 2 voxels of 2 mm), or None.
+    """Return the files of the brain in the PyPI wheel ``mdt`` (104 × 104 × 2 voxels of 2 mm), or None without it.
 
     The function reads the wheel's metadata and does not import it. The wheel's version is 1.2.7, its licence
     LGPL-3.0-or-later; install it with ``--no-deps``. It has 13 images at b = 0, 30 at 1000 and 60 at 2000 s/mm².
@@ -83,13 +82,13 @@ def fit_dwi(
             ``"um2/ms"`` for ms/µm². None means mm²/s.
         noise: the standard deviation of the images' noise, in the images' unit, from which the tensors' covariance is
             computed. ``"residuals"`` estimates the deviation in each voxel from the residuals of the fit, which have
-            n − 7 degrees of freedom, and also keeps the noise of an image that voxels share (24 bytes for each voxel
-            and image). If None, no covariance is computed.
+            n − 7 degrees of freedom, and also keeps the contribution of each image to the noise, which voxels may share
+            (24 bytes for each voxel and image). If None, no covariance is computed.
 
     Returns:
         Tensors along the voxel axes, in mm²/s, and with `noise` their noise to first order (`TensorVolume.noise`). DIPY
         raises eigenvalues that are not positive to about 1e-9 mm²/s, and a note reports the number of such voxels. Most
-        of them are at the boundary of the mask, so eroding the mask removes them.
+        such voxels are at the boundary of the mask, so eroding the mask removes them.
 
     Raises:
         ImportError: DIPY or nibabel is missing.
@@ -104,7 +103,7 @@ def fit_dwi(
         >>> print(volume.tensors[0, 0, 0].diagonal().round(6))  # mm²/s
         [0.001 0.001 0.001]
     """
-    dti, gradients, segmentation = map(optional, ("dipy.reconst.dti", "dipy.core.gradients", "dipy.segment.mask"))
+    dti, gradients = optional("dipy.reconst.dti"), optional("dipy.core.gradients")
     name = os.fspath(path)
     image = nifti.load(name)
     affine, _ = nifti.affine_in_mm(name, image)
@@ -125,11 +124,11 @@ def fit_dwi(
     if weighted < 6 or weighted == used.sum():
         raise ValueError(
             f"b_max: got {b_max}, which leaves {weighted} weighted and {int(used.sum()) - weighted} unweighted images; "
-            "expected at least 6 and 1. Raise the limit"
+            "expected at least 6 weighted images and 1 unweighted image. Raise the limit"
         )
     directions, remarks = _of_length_one(os.fspath(bvec), directions, used & (b > threshold))
     signal = nifti.voxels(name, image)[..., used]
-    inside, found = _inside(name, mask, signal, b[used] <= threshold, affine, segmentation)
+    inside, found = _inside(name, mask, signal, b[used] <= threshold, affine)
     table = gradients.gradient_table(b[used], bvecs=directions[used], b0_threshold=threshold)
     fit = dti.TensorModel(table).fit(signal, mask=inside)
     fitted = Matrices(np.where(inside[..., None, None], fit.quadratic_form, 0.0), "fit", None)
@@ -160,8 +159,8 @@ def fit_dwi(
 # σ²(XᵀW²X)⁻¹. The estimate of σ² is the sum of squared residuals of the signals, divided by the number of images minus
 # the number of unknowns (Koay, Chang, Pierpaoli and Basser 2007).
 # The residual rₙ of the signal of image n changes β by (XᵀW²X)⁻¹ Xₙ wₙ rₙ. It has the variance σ²(1 − h), where
-# h = wₙ² Xₙᵀ(XᵀW²X)⁻¹Xₙ, so rₙ/√(1 − h) has the variance of the noise (MacKinnon and White 1985, HC2). Random signs of
-# whole images preserve the noise that voxels share.
+# h = wₙ² Xₙᵀ(XᵀW²X)⁻¹Xₙ, so rₙ/√(1 − h) has the variance of the noise (MacKinnon and White 1985, HC2). Samples of the
+# noise draw one random factor for each image, which preserves correlations of the noise between voxels.
 def _covariance(
     signal: Float[np.ndarray, "nx ny nz n"],
     inside: Bool[np.ndarray, "nx ny nz"],
@@ -172,7 +171,7 @@ def _covariance(
 ) -> tuple[Float[np.ndarray, "nx ny nz 6 6"], Float[np.ndarray, "nx ny nz n 6"] | None]:
     """Return the covariance of the components xx xy yy xz yz zz along the voxel axes, which is zero outside the mask.
 
-    From residuals, also return the contribution of each image to the noise of these components, or else None.
+    If `noise` is ``"residuals"``, also return the contribution of each image to their noise; otherwise None.
     """
     data = np.asarray(signal[inside], np.float64)
     positive = data[data > 0]
@@ -188,7 +187,7 @@ def _covariance(
                 f"{design.shape[1]} unknowns; expected at least {design.shape[1] + 1} images, and 15 for an estimate "
                 "with an error of 25 %. Give the standard deviation of the noise as a number"
             )
-        # The residuals are those of the signals, because logarithms of small signals have large errors.
+        # Residuals of the signals are used, because logarithms of small signals have large errors.
         fitted = np.exp(np.einsum("na,vab,vb->vn", design, inverse, (weights * y) @ design, optimize=True))
         left = data - fitted
         variance = np.sum(left**2, axis=1) / freedom
@@ -205,7 +204,7 @@ def _covariance(
     covariance[inside] = turned @ (variance[:, None, None] * inverse[:, :6, :6]) @ turned.T
     if noise != "residuals":
         return covariance, None
-    # The fit follows some images exactly, such as a single unweighted one; a random ±σ replaces their residual 0.
+    # The fit equals some images exactly, such as a single unweighted image. A random ±σ replaces their residual 0.
     unseen = np.random.default_rng(0).choice([-1.0, 1.0], data.shape) * np.sqrt(variance)[:, None]
     modes = np.zeros((*inside.shape, len(design), 6), np.float32)
     for i, x in enumerate(design):  # a loop saves memory
@@ -244,14 +243,14 @@ def _inside(
     signal: Float[np.ndarray, "nx ny nz n"],
     unweighted: Bool[np.ndarray, " n"],
     affine: Float[np.ndarray, "4 4"],
-    segmentation: ModuleType,
 ) -> tuple[Bool[np.ndarray, "nx ny nz"], list[str]]:
     """Return the given or computed mask without voxels whose signal is not finite, and notes about the mask."""
     notes, finite = [], np.isfinite(signal)
     if mask is None:
         # Resampling can produce NaN outside the brain; here NaN is replaced by zero signal.
         with np.errstate(invalid="ignore"):  # median_otsu divides by zero if its median filter returns zeros
-            _, brain = segmentation.median_otsu(np.where(finite, signal, 0.0)[..., unweighted].mean(axis=-1))
+            mean = np.where(finite, signal, 0.0)[..., unweighted].mean(axis=-1)
+            _, brain = optional("dipy.segment.mask").median_otsu(mean)
         if not brain.any():
             raise ValueError("mask: DIPY's median_otsu finds no brain in the unweighted images. Pass a mask")
         inside = brain.astype(bool)

@@ -46,14 +46,14 @@ def read_tensors(
       declares the order, and the sidecar may declare the frame. The tensors may also be in six images of one component
       each; give the path of one of them, or all six.
     - MRtrix: an image (nx, ny, nz, 6), as dwi2tensor writes it.
-    - NRRD: any axis may hold the components. Its kind is one of the format's 2D or 3D matrices, or the axis has six
+    - NRRD: any axis may hold the components. Its kind is one of NRRD's 2D or 3D matrices, or the axis has six
       components (three in the plane) and `order` is given. The measurement frame is applied. If the file's space is
       patient-based, the affine's axes are right, anterior, superior.
     - VTK (``.vti``, structured points in ``.vtk``): tensors of nine or six components at points or cells, and an
-      optional array ``mask``. An image one voxel thick whose tensors vanish across it gives 2×2 tensors.
-    - npz: the array ``tensors`` (nx, ny, 2, 2) or (nx, ny, nz, 3, 3), array axis a along coordinate a, or with six
-      components (three in the plane) if `order` is given. Optional are ``spacing`` (d,) = 1, ``origin`` (d,) = 0,
-      ``mask`` (*shape,), ``affine`` (4, 4), ``order`` and ``frame``. npy: only the tensors.
+      optional array ``mask``. An image one voxel thick gives 2×2 tensors if the components across it are zero.
+    - npz: the array ``tensors`` (nx, ny, 2, 2) or (nx, ny, nz, 3, 3), where array axis a runs along coordinate a,
+      or with six components (three in the plane) if `order` is given. Optional arrays are ``spacing`` (d,) = 1,
+      ``origin`` (d,) = 0, ``mask`` (*shape,), ``affine`` (4, 4), ``order`` and ``frame``. npy: only the tensors.
 
     Args:
         path: the file, or six files.
@@ -70,7 +70,7 @@ def read_tensors(
         repair: the repair of tensors inside the mask that are not positive definite; see `repair_tensors`. If None, the
             tensors stay unchanged, but no metric can be made from them.
         unit: the unit of the tensors, ``"mm2/s"``, ``"um2/ms"`` (10⁻³ mm²/s), ``"um2/s"``, ``"cm2/s"`` or ``"m2/s"``.
-            They are converted from this unit to mm²/s; None leaves the numbers unchanged.
+            The tensors are converted from this unit to mm²/s; None leaves the numbers unchanged.
 
     Returns:
         The tensors along the voxel axes; `questions` reports a frame or a unit that looks wrong.
@@ -91,17 +91,17 @@ def read_tensors(
     paths = nifti.siblings(path) if isinstance(path, str | os.PathLike) else [os.fspath(each) for each in path]
     if len(paths) != 1:
         if array is not None or spacing is not None:
-            raise ValueError("array, spacing: only NumPy's and VTK's files need them. Leave them out for six images")
+            raise ValueError("array, spacing: got one of them for six images, which do not need it. Leave it out")
         volume = nifti.read_components(paths, order, frame)
     else:
         (name,), reader = paths, format_of(paths[0])
         if array is not None and "array" not in reader.options:
             raise ValueError(f"array: got {array!r}, but only npz and VTK files have named arrays. Leave it out")
         if spacing is not None and "spacing" not in reader.options:
-            raise ValueError(f"spacing: {name} declares its own; only NumPy's files may lack one. Leave it out")
+            raise ValueError(f"spacing: {name} declares its spacing; only NumPy's files may lack it. Leave it out")
         given = {"array": array, "spacing": spacing, "confidence": confidence}
         volume = reader.read_tensors(name, order, frame, **{option: given[option] for option in reader.options})
-        if not name.lower().endswith(".nhdr"):  # a detached header does not identify the data file
+        if not name.lower().endswith(".nhdr"):  # the digest of a detached header would not identify the data
             volume = replace(volume, digest=digest(name))
     if unit is not None:
         volume = in_mm2_per_s(volume, unit)
@@ -132,7 +132,7 @@ def save(
     - ``.vtu``, ``.vtk``, ``.msh`` (Gmsh), and for triangles ``.ply``: the mesh and one array per time.
 
     Every file contains a JSON record of its origin: the version, the tensors' file with its SHA-256, order and frame,
-    the decisions of the reader, and `provenance`. For a mesh not in npz, the record is in a second file, whose path is
+    the notes about its reading, and `provenance`. For a mesh not in npz, the record is in a second file, whose path is
     `path` with ``.json`` appended. Files are written atomically.
 
     Args:
@@ -181,8 +181,9 @@ def save_tensors(
 
     - ``.nii``, ``.nii.gz``: a symmetric-matrix image (nx, ny, nz, 1, 6) with xx xy yy xz yz zz along the voxel axes.
       The tensors are zero outside the mask. Slices cannot be written.
-    - ``.nrrd``: masked symmetric matrices, 3D or 2D, with the measurement frame; without the position of a slice.
-    - ``.vti``: nine components at the points, along the axes of space, and the mask; zeros across the plane of a slice.
+    - ``.nrrd``: masked symmetric matrices, 3D or 2D, with the measurement frame, without the position of a slice.
+    - ``.vti``: nine components at the points, along the axes of space, and the mask. A slice gets zeros for the
+      components across its plane.
     - ``.npz``: the arrays that `read_tensors` documents.
 
     The file contains the record that `save` describes, and the order and frame of the tensors, so `read_tensors` needs

@@ -1,5 +1,6 @@
 """Read masks, which mark the voxels of the domain, and label maps, which number the regions."""
 
+import math
 import os
 import re
 from pathlib import Path
@@ -80,10 +81,10 @@ def erode(mask: Bool[np.ndarray, "*shape"], iterations: int = 1) -> Bool[np.ndar
 
 
 def read_labels(path: str | os.PathLike[str], on: TensorVolume | SimplicialMesh) -> Integer[np.ndarray, "*shape"]:
-    """Read integer labels, with 0 for unlabelled, at an image's voxels or a mesh's vertices, from NIfTI or ``.npy``.
+    """Read integer labels (0 means unlabelled) at the voxels of an image or vertices of a mesh, in NIfTI or ``.npy``.
 
-    If both files have an affine, their voxels must coincide. For a slice, the file may have the labels of the whole
-    volume, or of the slice in two dimensions. Otherwise, the labels must have the shape of the image.
+    If the labels and the image have affines, their voxels must coincide. For a slice, the file may have the labels of
+    the whole volume, or of the slice in two dimensions. Otherwise, the labels must have the shape of the image.
     """
     shape, affine = (on.shape, on.affine) if isinstance(on, TensorVolume) else ((len(on.vertices),), None)
     name = os.fspath(path)
@@ -127,10 +128,14 @@ def names_beside(path: str | os.PathLike[str]) -> str | None:
 
 
 def _image(name: str, affine: np.ndarray | None, suffixes: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the voxel values, without trailing axes of length one, and the affine or None."""
+    """Return the voxel values, without trailing axes of length one, and the affine or None; `affine` is the image's."""
     read = format_of(name, suffixes).read_image
     assert read is not None
-    values, place = read(name, affine)
+    values, place, unit = read(name)
+    if place is not None and affine is not None and not unit:  # some programs lose the unit, which is mm, m or µm
+        ratio = np.linalg.norm(affine[:3, :3]) / np.linalg.norm(place[:3, :3])
+        scale = min((1.0, 1e3, 1e-3), key=lambda s: abs(math.log(ratio / s)))
+        place = np.diag([scale, scale, scale, 1.0]) @ place
     while values.ndim > 3 and values.shape[-1] == 1:
         values = values[..., 0]
     return values, place

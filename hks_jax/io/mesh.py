@@ -39,7 +39,7 @@ def read_mesh(path: str | os.PathLike[str], *, clean: bool = False, in_space: bo
     ``.vtp``; nibabel reads GIFTI (``.gii``) and FreeSurfer's surfaces (``lh.white``, …, recognised by their first
     bytes). The formats ``.obj`` and ``.off`` need no library.
 
-    Quadrilaterals are cut into triangles. In polygonal data, OBJ and OFF, all polygons are cut. Vertices keep their
+    Quadrilaterals are cut into triangles, as are all polygons in polygonal data, OBJ and OFF. Vertices keep their
     order. In STL, coincident corners of triangles become one vertex. Cells of lower dimension beside tetrahedra are
     ignored. A warning reports coincident vertices, as at the seams of a texture, because the surface is torn there.
 
@@ -226,7 +226,7 @@ def _cleaned(loaded: Loaded) -> tuple[Loaded, str]:
 def _without_thin(
     vertices: Float[np.ndarray, "V 3"], cells: Int[np.ndarray, "n 3"]
 ) -> tuple[Int[np.ndarray, "m 3"], int]:
-    """Flip triangles of nearly zero height, or remove them at a boundary; return triangles and number of flips."""
+    """Flip the longest edge of triangles of nearly zero height, or remove them at a boundary; also count the flips."""
     cells, gone, flipped = cells.copy(), np.zeros(len(cells), bool), 0
     corners = vertices[cells]
     lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)

@@ -63,7 +63,7 @@ _COUNTS = {
 """Patterns of the declared numbers of points and cells in each format. For .stl, meshio compares the length itself."""
 
 _PLY = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
-"""The size in bytes of types in .ply that have other names in NumPy."""
+"""The size in bytes of those types in .ply that have another name in NumPy."""
 
 
 def _declared(content: bytes, suffix: str) -> tuple[int, ...]:
@@ -88,7 +88,7 @@ def _compare(content: bytes, suffix: str, declared: tuple[int, ...], mesh: Any) 
     if lists is not None:  # before version 5, the declared number also counts one entry per cell
         listed = int(lists[2]) - (0 if re.match(rb"# vtk DataFile Version [5-9]", content) else counts[1])
         if listed != corners:  # if a cell's type is wrong, meshio omits corners
-            raise ValueError(f"the file lists {listed} corners of cells; their types have {corners} corners")
+            raise ValueError(f"the file lists {listed} corners, but cells of the declared types have {corners}")
     if suffix == ".ply":
         _compare_ply(content, mesh)
 
@@ -99,7 +99,7 @@ def _compare_ply(content: bytes, mesh: Any) -> None:
     of_points, _, of_cells = head.partition(b"element face")
     lists = re.findall(rb"property\s+list\s+(\w+)\s+(\w+)", of_cells)
     if len(lists) != 1:
-        return  # the file declares no total length of other lists
+        return  # with other lists, the length of the cells is unknown
 
     def size(name: bytes) -> int:
         return 1 if ascii_ else _PLY.get(name.decode()) or np.dtype(name.decode()).itemsize
@@ -175,7 +175,7 @@ def fans(
     """Cut polygons into triangles that share the first corner from which all others are visible.
 
     Raises:
-        ValueError: a vertex does not exist, or a polygon has no such corner; `numbers` are its numbers in the file.
+        ValueError: a vertex does not exist, or a polygon has no such corner. The message gives its entry in `numbers`.
     """
     if polygons.ndim != 2 or polygons.shape[1] < 3:
         raise ValueError(f"{file}: got faces of shape {polygons.shape}; expected at least 3 corners each")
@@ -246,13 +246,13 @@ def load_off(file: Path) -> Loaded:
         rows = [line.split() for line in rest]
         columns = {len(row) for row in rows[:n_vertices]}
         if len(columns) != 1 or min(columns) < 3:
-            raise ValueError(f"lines of vertices have {sorted(columns)} columns; expected 3 coordinates on each")
+            raise ValueError(f"lines of vertices have {sorted(columns)} columns; expected equal numbers, at least 3")
         vertices = [[float(word) for word in row[:3]] for row in rows[:n_vertices]]
         polygons = [[int(word) for word in row[1 : 1 + int(row[0])]] for row in rows[n_vertices:]]
         for row, corners in zip(rows[n_vertices:], polygons, strict=True):
             # A colour may follow the corners, as an index or as three or four numbers.
             if len(corners) != int(row[0]) or len(corners) < 3 or len(row) - 1 - len(corners) > 4:
-                raise ValueError(f"got the face {' '.join(row)[:60]}; expected n, n corners, optional colour")
+                raise ValueError(f"got the face {' '.join(row)[:60]}; expected n, n corners, an optional colour")
     return _triangulated(file, vertices, polygons)
 
 

@@ -18,8 +18,8 @@ _MAGIC = b"mrtrix image"
 _KINDS = {"Int": "i", "UInt": "u", "Float": "f"}
 
 
-def load(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, Float[np.ndarray, "4 4"]]:
-    """Return the voxel values along the header's axes, and the affine to scanner coordinates in mm."""
+def _load(name: str) -> tuple[np.ndarray, Float[np.ndarray, "4 4"], str]:
+    """Return the voxel values, with axes in the header's sequence, the affine to scanner coordinates, and the unit."""
     file = existing(name)
     with reading(file, "a readable MRtrix image (.mif)"):
         content = gzip.decompress(file.read_bytes()) if file.name.lower().endswith(".gz") else file.read_bytes()
@@ -41,12 +41,12 @@ def load(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, Float
         affine[:3] = [[float(word) for word in row.split(",")] for row in header["transform"]]
         affine[:3, :3] *= [float(word) for word in header["vox"][0].split(",")[:3]]
         if not np.isfinite(affine).all() or np.linalg.det(affine[:3, :3]) == 0:
-            raise ValueError("transform, vox: got an affine that is singular or not finite")
-    return values, affine
+            raise ValueError("transform, vox: got a singular or infinite affine; expected an invertible affine")
+    return values, affine, "mm"
 
 
 def _read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolume:
-    values, affine = load(name)
+    values, affine, _ = _load(name)
     if values.ndim != 4 or values.shape[-1] != 6:
         raise ValueError(
             f"{name}: got an image of shape {values.shape}; expected (nx, ny, nz, 6), the components from dwi2tensor"
@@ -57,7 +57,7 @@ def _read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolu
 
 
 def _header(content: bytes) -> tuple[dict[str, list[str]], int]:
-    """Return the values of each key, and the byte offset of the voxels."""
+    """Return the values of each key in the header, and the byte offset of the voxels."""
     end = content.find(b"\nEND\n")
     if not content.startswith(_MAGIC) or end < 0:
         raise ValueError(f"the file does not begin with {_MAGIC.decode()!r} and a header that ends with END")
@@ -67,7 +67,7 @@ def _header(content: bytes) -> tuple[dict[str, list[str]], int]:
         header.setdefault(key.strip(), []).append(value.strip())
     where, offset = header["file"][0].split()
     if where != "." or int(offset) < end:
-        raise ValueError(f"file: got {header['file'][0]!r}; expected voxels in the file itself, '. OFFSET'")
+        raise ValueError(f"file: got {header['file'][0]!r}; expected '. OFFSET', for voxels in the same file")
     return header, int(offset)
 
 
@@ -81,7 +81,7 @@ def _dtype(name: str) -> np.dtype:
 
 
 def _in_order(flat: np.ndarray, shape: tuple[int, ...], layout: str) -> np.ndarray:
-    """Return the values along the header's axes; a layout such as ``-0,+1,+2`` gives each axis's rank and direction."""
+    """Return the stored values as an array; a layout such as ``-0,+1,+2`` gives the rank and direction of each axis."""
     words = [word.strip() for word in layout.split(",")]
     ranks = [int(word.lstrip("+-")) for word in words]
     if sorted(ranks) != list(range(len(shape))):
@@ -92,4 +92,4 @@ def _in_order(flat: np.ndarray, shape: tuple[int, ...], layout: str) -> np.ndarr
     return values[tuple(slice(None, None, -1 if word.startswith("-") else 1) for word in words)]
 
 
-FORMAT = Format((".mif", ".mif.gz"), _read_tensors, read_image=load, image=".nii.gz")
+FORMAT = Format((".mif", ".mif.gz"), _read_tensors, read_image=_load, image=".nii.gz")

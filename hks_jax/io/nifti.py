@@ -12,12 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from hks_jax.checks import require_real
 from hks_jax.io.questions import OPEN_FRAME
 from hks_jax.io.repair import require_symmetric
 from hks_jax.io.tables import write_json
 from hks_jax.io.tensor_order import FRAMES, ORDERS, matrices, pack
-from hks_jax.io.units import by_axis, scaled_beside
+from hks_jax.io.units import by_axis
 from hks_jax.io.volume import Format, TensorVolume, corners, describe_tensors, images_of, own_record, placed
 from hks_jax.optional import optional
 from hks_jax.storage import atomic_path, existing, reading
@@ -28,11 +27,11 @@ SYMMETRIC_MATRIX = 1005
 COMMENT = 6
 """NIfTI's code for a comment in an extension of the header."""
 _LENGTHS = {0: ("", 1.0), 1: ("m", 1e3), 2: ("mm", 1.0), 3: ("um", 1e-3)}
-"""The unit of space for each of NIfTI's codes, and its length in mm. A missing unit means mm, as in other programs."""
+"""The unit of length for each code in NIfTI's xyzt_units, and its size in mm. Code 0, no unit, is read as mm."""
 _REFERENCES = {"ijk": "voxel", "bvec": "fsl", "xyz": "world", "scanner": "world"}
-"""The frame for each value of Reference in BIDS's field OrientationEncoding, including the values of its drafts."""
+"""The frame for each value of Reference in BIDS's field OrientationEncoding, including values from drafts of BIDS."""
 _COMPONENT = re.compile(r"(?:^|[_.-])(?:dt|t|d)?(xx|xy|xz|yy|yz|zz)(?=[_.])", re.IGNORECASE)
-"""The component in a file's name, as BIDS (``param-txx``), DSI Studio and ANTs write it."""
+"""The pattern of the component in a file's name, as BIDS (``param-txx``), DSI Studio and ANTs write it."""
 
 
 def is_nifti(path: str | os.PathLike[str]) -> bool:
@@ -41,7 +40,7 @@ def is_nifti(path: str | os.PathLike[str]) -> bool:
 
 
 def load(name: str) -> Any:
-    """Open a NIfTI image and check its length; read compressed files to the end, which checks the checksum."""
+    """Open a NIfTI image, and check its length and the checksum of a compressed file."""
     nib, file = optional("nibabel"), existing(name)
     with reading(file, "a readable NIfTI image"):
         image, length = nib.load(file), file.stat().st_size
@@ -57,10 +56,9 @@ def load(name: str) -> Any:
 
 
 def voxels(name: str, image: Any) -> np.ndarray:
-    """Return the scaled voxel values of a loaded image, in the stored floating-point type or float64."""
+    """Return the voxel values of a loaded image after its scaling, in float32 if they are stored so, or in float64."""
     with reading(name, "a readable NIfTI image"):
         data = np.asarray(image.dataobj)
-    require_real(name, data)
     if data.dtype.kind not in "fiub":
         raise ValueError(f"{name}: got voxels of type {data.dtype}; expected real numbers")
     dtype = data.dtype if data.dtype.kind == "f" and data.dtype.itemsize in (4, 8) else np.dtype(np.float64)
@@ -68,19 +66,18 @@ def voxels(name: str, image: Any) -> np.ndarray:
 
 
 def affine_in_mm(name: str, image: Any) -> tuple[np.ndarray, str]:
-    """Return the affine with lengths in mm, and the declared unit, or the empty text if there is none."""
+    """Return the affine with lengths in mm, and the unit of length that the file declares, or the empty text."""
     code = int(image.header["xyzt_units"]) & 7
     if code not in _LENGTHS:
-        raise ValueError(f"{name}: got the code {code} for the unit of space; expected 0 to 3. Correct xyzt_units")
+        raise ValueError(f"{name}: got the code {code} for the unit of length; expected 0 to 3. Correct xyzt_units")
     unit, scale = _LENGTHS[code]
     return np.diag([scale, scale, scale, 1.0]) @ np.asarray(image.affine, np.float64), unit
 
 
-def _read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return voxel values and the affine in mm; if the file has no unit, guess it from the related affine `beside`."""
+def _read_image(name: str) -> tuple[np.ndarray, np.ndarray, str]:
+    """Return voxel values, the affine in mm, and the unit of length that the file declares."""
     image = load(name)
-    own, unit = affine_in_mm(name, image)
-    return voxels(name, image), own if unit or beside is None else scaled_beside(own, beside)
+    return voxels(name, image), *affine_in_mm(name, image)
 
 
 def sidecar_of(path: str | os.PathLike[str]) -> Path:
@@ -116,13 +113,13 @@ def _own_record(image: Any, affine: np.ndarray) -> dict[str, Any]:
 
 
 def read_tensors(name: str, order: str | None, frame: str | None, image: Any = None) -> TensorVolume:
-    """Read tensors, or return those of a loaded image; see `hks_jax.io.read_tensors`."""
+    """Read tensors from a file, or from the loaded image `image`; see `hks_jax.io.read_tensors`."""
     image = load(name) if image is None else image
     shape = image.shape
     if shape[3:] not in ((6,), (1, 6)):
         remedy = "Fit tensors to diffusion-weighted images first by hks_jax.io.fit_dwi, or by --bval and --bvec"
         if shape[3:] == (8,):
-            remedy += '. Camino writes an exit code and log S₀ before the six: remove both, and pass the order "fsl"'
+            remedy += '. Camino writes an exit code and log S₀ before the tensor: remove both, and pass order "fsl"'
         raise ValueError(
             f"{name}: got an image of shape {shape}; expected six components per voxel, (nx, ny, nz, 1, 6) or "
             f"(nx, ny, nz, 6). {remedy}"
@@ -130,7 +127,7 @@ def read_tensors(name: str, order: str | None, frame: str | None, image: Any = N
     declared = int(image.header["intent_code"]) == SYMMETRIC_MATRIX
     affine, length_unit = affine_in_mm(name, image)
     encoding, record, notes = _encoding(name), _own_record(image, affine) if declared else {}, list[str]()
-    by_bids = "fsl" if encoding.get("Type") == "tensor" else ""  # xx xy xz yy yz zz
+    by_bids = "fsl" if encoding.get("Type") == "tensor" else ""  # BIDS has FSL's order, xx xy xz yy yz zz
     found = matrices(name, voxels(name, image).reshape(*shape[:3], 6), order, "nifti" if declared else by_bids)
     if declared and found.order != "nifti":
         notes.append(f'components read in order "{order}", as asked; the file declares NIfTI\'s symmetric-matrix order')
@@ -162,7 +159,7 @@ def component_of(path: str | os.PathLike[str]) -> str | None:
 
 
 def siblings(path: str | os.PathLike[str]) -> list[str]:
-    """Return the paths of six images of one component each if this is one of them, or else only this path.
+    """Return the paths of all six images of components if `path` is one of them, or else only `path`.
 
     Such an image is in NIfTI and has one value per voxel. The six names differ only in the component.
     """
@@ -184,8 +181,8 @@ def siblings(path: str | os.PathLike[str]) -> list[str]:
 def read_components(paths: Sequence[str], order: str | None, frame: str | None) -> TensorVolume:
     """Read tensors from six images in any sequence; each file's name states its component.
 
-    If `frame` is None, the BIDS sidecar of the image gives the axes of the components (``Reference`` in
-    ``OrientationEncoding``). Without a sidecar, they are the voxel axes.
+    If `frame` is None, the BIDS sidecar of the image of xx gives the axes of the components (``Reference`` in
+    ``OrientationEncoding``). Without a sidecar, the components are along the voxel axes.
     """
     if order is not None:
         raise ValueError(f"order: got {order!r}, but the names of six images state their components. Leave it out")
@@ -202,10 +199,10 @@ def read_components(paths: Sequence[str], order: str | None, frame: str | None) 
     for name, image in zip(names, images, strict=True):
         if image.shape != first.shape or math.prod(image.shape[3:]) != 1:
             raise ValueError(
-                f"{files[name]}: got shape {image.shape}; expected one component per voxel, and equal shapes"
+                f"{files[name]}: got shape {image.shape}; expected one component per voxel, and six equal shapes"
             )
         if not np.allclose(affine_in_mm(files[name], image)[0], affine, rtol=1e-4, atol=1e-3):
-            raise ValueError(f"{files[name]}: its affine differs from the affine of {files['xx']}; expected equal ones")
+            raise ValueError(f"{files[name]}: its affine differs from that of {files['xx']}; expected equal affines")
     values = np.stack([voxels(files[name], image) for name, image in zip(names, images, strict=True)], axis=-1)
     joined = optional("nibabel").Nifti1Image(values.reshape(*first.shape[:3], 1, 6), first.affine)
     joined.header["xyzt_units"] = first.header["xyzt_units"]
@@ -247,7 +244,7 @@ def _write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra
 
 def _write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
     if volume.dimension != 3:
-        raise ValueError("volume: got a slice, but NIfTI has no 2×2 tensors. Write .npz, .nrrd or .vti, or the volume")
+        raise ValueError("volume: got a slice, but NIfTI has no 2×2 tensors. Write .npz, .nrrd, .vti or a volume")
     require_symmetric(volume)
     components = np.where(volume.inside[..., None, None], pack(volume.tensors, "nifti")[..., None, :], 0)
     image = optional("nibabel").Nifti1Image(components, volume.volume_affine)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from hks_jax.io.repair import require_symmetric
 from hks_jax.io.tensor_order import matrices, nearest_rotation, pack, to_voxel_axes
-from hks_jax.io.units import millimetres, scaled_beside
+from hks_jax.io.units import millimetres
 from hks_jax.io.volume import Format, TensorVolume, describe_tensors, images_of, own_record
 from hks_jax.optional import optional
 from hks_jax.storage import atomic_path, existing, reading
@@ -23,18 +23,13 @@ KINDS = {
     for masked in ("", "masked-")
     for symmetric in ("", "symmetric-")
 }
-"""The kinds of axes that hold tensor components, and their number of entries including the confidence."""
+"""For each kind of axis that contains the components of a tensor, the number of its entries, with any confidence."""
 
-
-_FIELDS = frozenset(
-    name
-    for names in (
-        "dimension, type, block size, blocksize, encoding, endian, content, min, max, old min, oldmin, old max, oldmax",
-        "data file, datafile, line skip, lineskip, byte skip, byteskip, number, sample units, sampleunits, sizes",
-        "spacings, thicknesses, axis mins, axismins, axis maxs, axismaxs, centers, centerings, labels, units, kinds",
-        "space, space dimension, space units, space origin, space directions, measurement frame",
-    )
-    for name in names.split(", ")
+_FIELDS = (
+    "dimension, type, block size, blocksize, encoding, endian, content, min, max, old min, oldmin, old max, oldmax, "
+    "data file, datafile, line skip, lineskip, byte skip, byteskip, number, sample units, sampleunits, sizes, "
+    "spacings, thicknesses, axis mins, axismins, axis maxs, axismaxs, centers, centerings, labels, units, kinds, "
+    "space, space dimension, space units, space origin, space directions, measurement frame"
 )
 """All fields of the format (Teem, "Definition of NRRD File Format")."""
 
@@ -43,7 +38,7 @@ _PATIENT = {
     "left-anterior-superior": (-1.0, 1.0, 1.0),
     "left-posterior-superior": (-1.0, -1.0, 1.0),
 }
-"""The patient-based spaces, and the signs that transform them to right, anterior, superior, NIfTI's axes."""
+"""The patient-based spaces, and the signs that transform their coordinates to NIfTI's: right, anterior, superior."""
 
 _SHORT = {"".join(word[0] for word in name.split("-")): name for name in _PATIENT}
 _SPACES = (*_PATIENT, "scanner-xyz", "3d-right-handed", "3d-left-handed")
@@ -53,15 +48,23 @@ _OPENED: dict[str, Any] = {"gzip": gzip.open, "gz": gzip.open, "bzip2": bz2.open
 
 
 class Placement(NamedTuple):
-    """The position of the voxels, in mm if the file declares a unit."""
+    """The position of the voxels, in mm if the file declares a unit.
 
-    directions: Float[np.ndarray, "d d"]  # column a is the step along voxel axis a, in the file's space
-    origin: Float[np.ndarray, " d"]  # the position of voxel 0, in the file's space
-    # The signs that transform the file's space to right, anterior, superior; None if it is not patient-based.
+    Attributes:
+        directions: column a is the step along voxel axis a, in the file's space.
+        origin: the position of voxel 0, in the file's space.
+        signs: the signs that transform the file's space to right, anterior, superior; None if it is not patient-based.
+        measured: the vectors of the measurement frame as columns, or None.
+        placed: whether the file gives directions, and not only spacings.
+        unit: the file's unit of length; empty if there is none.
+    """
+
+    directions: Float[np.ndarray, "d d"]
+    origin: Float[np.ndarray, " d"]
     signs: Float[np.ndarray, " d"] | None
-    measured: Float[np.ndarray, "m n"] | None  # the vectors of the measurement frame as columns
-    placed: bool  # whether the file gives directions, and not only spacings
-    unit: str  # the file's unit of length; empty if there is none
+    measured: Float[np.ndarray, "m n"] | None
+    placed: bool
+    unit: str
 
     @property
     def affine(self) -> Float[np.ndarray, "4 4"] | None:
@@ -77,7 +80,7 @@ class Placement(NamedTuple):
 
 
 def load(name: str) -> tuple[np.ndarray, dict[str, Any]]:
-    """Return the header and the array in native byte order; its first axis is the fastest in the file."""
+    """Return the array in native byte order, with the fastest axis of the file first, and the header."""
     nrrd, file = optional("nrrd"), existing(name)
     with reading(file, "a readable NRRD file"), open(file, "rb") as stream, warnings.catch_warnings():
         warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)  # malformed text
@@ -92,16 +95,16 @@ def load(name: str) -> tuple[np.ndarray, dict[str, Any]]:
 
 
 def _check_header(text: bytes, header: Mapping[str, Any]) -> None:
-    """Raise ValueError for a line that is neither a field of the format nor a key, and for a field of wrong length.
+    """Raise ValueError for a header line that is neither a field nor a key, and for a field of wrong length.
 
-    Without this check, a field with a damaged name would be ignored and have its default, such as a spacing of one.
+    Without this check, a field with a damaged name would be ignored and have its default, such as a spacing of 1.
     """
     for line in text.splitlines()[1:]:
         if line.startswith(b"#") or not line:
             continue
         key, colon, value = line.partition(b":")
         name, is_key = key.decode("latin-1"), value.startswith(b"=")
-        if not colon or (name in _FIELDS) == is_key or (not is_key and not line.isascii()) or b"\0" in line:
+        if not colon or (name in _FIELDS.split(", ")) == is_key or (not is_key and not line.isascii()) or b"\0" in line:
             raise ValueError(f"got the header line {line[:60]!r}; expected a field of the format, or a key and a value")
     n = int(header["dimension"])
     for name in _PER_AXIS:
@@ -111,7 +114,7 @@ def _check_header(text: bytes, header: Mapping[str, Any]) -> None:
 
 
 def _space_of(header: Mapping[str, Any]) -> str:
-    """Return the full name of the space in lower case, without its time axis, or the empty text."""
+    """Return the full name of the space in lower case, without its time axis, or the empty text if there is none."""
     space = str(header.get("space", "")).lower()
     name = _SHORT.get(space.removesuffix("t"), space.removesuffix("-time"))
     if "space" in header and name not in _SPACES:
@@ -120,7 +123,7 @@ def _space_of(header: Mapping[str, Any]) -> str:
 
 
 def _check_data(file: Path, header: Mapping[str, Any], start: int) -> None:
-    """Raise an error if compressed data are incomplete or fail their checksum; pynrrd compares the length of others."""
+    """Raise an error if compressed data are incomplete or fail their checksum; pynrrd checks uncompressed ones."""
     opened = _OPENED.get(str(header["encoding"]).lower())
     if opened is None:
         return
@@ -133,12 +136,11 @@ def _check_data(file: Path, header: Mapping[str, Any], start: int) -> None:
             content.read()
 
 
-def _read_image(name: str, beside: np.ndarray | None = None) -> tuple[np.ndarray, Float[np.ndarray, "4 4"] | None]:
-    """Return voxel values and any affine; if the file has no unit, guess it from the related affine `beside`."""
+def _read_image(name: str) -> tuple[np.ndarray, Float[np.ndarray, "4 4"] | None, str]:
+    """Return voxel values, the affine or None, and the unit of length that the file declares."""
     data, header = load(name)
     place = _placement(name, header, list(range(data.ndim)))
-    affine = place.affine
-    return data, affine if affine is None or beside is None or place.unit else scaled_beside(affine, beside)
+    return data, place.affine, place.unit
 
 
 def _read_tensors(name: str, order: str | None, frame: str | None, confidence: float) -> TensorVolume:
@@ -220,7 +222,7 @@ def _store(path: Path, array: np.ndarray, volume: TensorVolume, record: str, kin
     header: dict[str, Any] = {"space": "right-anterior-superior"} if placed else {"space dimension": d}
     if kind:
         directions, kinds = np.concatenate([none, directions]), [kind, *kinds]
-        header["measurement frame"] = nearest_rotation(linear).T  # the file lists the columns
+        header["measurement frame"] = nearest_rotation(linear).T  # NRRD lists this matrix by columns
     elif array.ndim > d:
         directions, kinds = np.concatenate([directions, none]), [*kinds, "list"]
     if placed or volume.length_unit:
@@ -264,7 +266,7 @@ def _rows(header: Mapping[str, Any], n: int) -> Float[np.ndarray, "n d"] | None:
 def _placement(name: str, header: Mapping[str, Any], domain: list[int]) -> Placement:
     d, rows = len(domain), _rows(header, int(header["dimension"]))
     unit, scales = _lengths(name, header, domain)
-    measured = np.asarray(header.get("measurement frame", np.nan), np.float64).T  # the file lists it by columns
+    measured = np.asarray(header.get("measurement frame", np.nan), np.float64).T  # NRRD lists this matrix by columns
     frame = measured if np.isfinite(measured).all() else None
     if rows is None:
         spacings = np.asarray(header.get("spacings", np.full(int(header["dimension"]), np.nan)), np.float64)[domain]
@@ -282,7 +284,7 @@ def _placement(name: str, header: Mapping[str, Any], domain: list[int]) -> Place
 
 
 def _lengths(name: str, header: Mapping[str, Any], domain: list[int]) -> tuple[str, Float[np.ndarray, " d"]]:
-    """Return the file's unit of length, empty if there is none, and its length in mm along each axis."""
+    """Return the file's unit of length, or the empty text, and its size in mm for each axis."""
     field = "space units" if "space directions" in header else "units"
     listed = list(header.get(field, ()))
     given = listed[: len(domain)] if field == "space units" else [listed[axis] for axis in domain if listed]
@@ -298,13 +300,13 @@ def _lengths(name: str, header: Mapping[str, Any], domain: list[int]) -> tuple[s
 def _to_voxel_axes(
     name: str, tensors: Float[np.ndarray, "*shape d d"], frame: str | None, place: Placement, notes: list[str]
 ) -> tuple[Float[np.ndarray, "*shape d d"], str]:
-    """Return the tensors along the voxel axes, and the frame in which the file gives them."""
+    """Return the tensors with components along the voxel axes, and the frame of the components in the file."""
     d, directions, columns = tensors.shape[-1], place.directions, place.measured
     if columns is None:
         if frame == "measurement":
             raise ValueError(f'frame: got {frame!r}, but {name} has no measurement frame; expected "voxel" or "world"')
         rotation = nearest_rotation(directions)
-        # If all voxel axes have the directions of the space's axes, or all are reversed, both frames agree.
+        # If all voxel axes have the directions of the space's axes, or all are reversed, "voxel" and "world" agree.
         same = np.allclose(rotation, np.eye(d), atol=1e-6) or np.allclose(rotation, -np.eye(d), atol=1e-6)
         if frame is None and not same:
             raise ValueError(

@@ -13,8 +13,8 @@ from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.pencil import AnyPencil
 from hks_jax.storage import load_npz, write_npz
 
-ARRAYS = tuple({field.name for field in fields(Eigenpairs)} - {"frame", "pencil", "solver_name"})
-"""The fields of `hks_jax.Eigenpairs` that are saved as arrays; `frame` has the values of `vectors`."""
+ARRAYS = tuple(f.name for f in fields(Eigenpairs) if f.name not in ("frame", "pencil", "solver_name"))
+"""The fields of `hks_jax.Eigenpairs` that are saved as arrays, without `frame`, which equals `vectors`."""
 _FAR = 1e-3
 """The residual, relative to the next eigenvalue, above which pairs count as belonging to another pencil."""
 
@@ -68,7 +68,7 @@ def load_pairs(path: str | os.PathLike[str], pencil: AnyPencil) -> Eigenpairs:
 
 
 def pairs_of(name: str, arrays: Mapping[str, np.ndarray], pencil: AnyPencil) -> Eigenpairs:
-    """Return the pairs in arrays from a file; see `load_pairs`."""
+    """Return the eigenpairs in the arrays of the file `name`; see `load_pairs`."""
     doubled = len(pencil.parts) > 1
     names = [key for key in ARRAYS if key != "part" or doubled]
     missing = [key for key in (*names, "solver_name") if key not in arrays]
@@ -101,7 +101,7 @@ def pairs_of(name: str, arrays: Mapping[str, np.ndarray], pencil: AnyPencil) -> 
 
 
 def _residuals(pairs: Eigenpairs, number: int) -> np.ndarray:
-    """Return ‖Kφ − λMφ‖ / ‖Mφ‖ for the pairs of one part of a doubled domain."""
+    """Return ‖Kφ − λMφ‖ / ‖Mφ‖ for the pairs of one pencil of `pencil.parts`."""
     part = pairs.pencil.parts[number]
     own = slice(None) if pairs.part is None else np.flatnonzero(np.asarray(pairs.part) == number)
     vectors = pairs.space.transfer(pairs.vectors[own], part.space)

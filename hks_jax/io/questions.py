@@ -14,12 +14,12 @@ from hks_jax.io.volume import AXES, TensorVolume
 ANISOTROPIC = 0.3
 """The fractional anisotropy above which a tensor's principal direction counts as the direction of a fibre."""
 _ENOUGH = 1000
-"""The least number of voxels with both neighbours along their direction for which frames are compared."""
+"""Frames are compared if at least this number of voxels have both neighbours along their direction."""
 _BLOCK, _BLOCKS = 8, 8
 """The size of blocks, in voxels per axis, and their least number. The standard error of a mean comes from the scatter
 between blocks, because neighbouring voxels are correlated."""
 CLEAR = 3.5
-"""The number of standard errors by which two means must differ."""
+"""The difference between two mean angles, in standard errors, above which it is significant."""
 _SMOOTH = 3.0
 """The mean angle, in degrees, below which differences between frames come from the discrete steps between voxels."""
 
@@ -31,15 +31,15 @@ class Alternative(NamedTuple):
 
     name: str  # a frame, or a reversed axis of the voxels or of the scanner
     is_frame: bool  # whether `name` is a frame
-    angle: float  # the mean angle, in degrees, between a principal direction and the mean of its two neighbours'
+    angle: float  # the mean angle, in degrees, between a principal direction and the mean direction of its neighbours
     errors: float  # the decrease of `angle` relative to the axes in which the file was read, in standard errors
 
 
 class Coherence(NamedTuple):
-    """How well fibres of neighbouring voxels line up, in the frame of the file and along alternative axes."""
+    """The alignment of fibres in neighbouring voxels, in the frame of the file and along alternative axes."""
 
     frame: str  # the frame in which the file was read
-    angle: float  # the mean angle, in degrees, between a principal direction and the mean of its two neighbours'
+    angle: float  # the mean angle, in degrees, between a principal direction and the mean direction of its neighbours
     others: tuple[Alternative, ...]  # results for alternative axes
 
     @property
@@ -104,7 +104,7 @@ def coherence(volume: TensorVolume) -> Coherence | None:
         angles = _angles(voxels, directions @ turn.T.astype(directions.dtype), index, spacing)
         both = np.isfinite(own) & np.isfinite(angles)
         gain = (own - angles)[both]
-        # The gain is zero everywhere if all fibres are straight along both sets of axes.
+        # If all fibres are straight along both sets of axes, all angles are zero, and so is the gain.
         if len(gain) < _ENOUGH or len(np.unique(block[both])) < _BLOCKS or not gain.any():
             continue
         scatter = math.sqrt(float((np.bincount(block[both], gain - gain.mean()) ** 2).sum()))
@@ -130,10 +130,10 @@ def _angles(
     index: Int[np.ndarray, "nx ny nz"],
     spacing: Float[np.ndarray, " 3"],
 ) -> Float[np.ndarray, " n"]:
-    """Return the angle, in degrees, between a direction and the mean of its two neighbours'; NaN without both.
+    """Return the angle, in degrees, between each direction and the mean direction of its two neighbours, or NaN.
 
     Along a curved fibre, the directions at the two neighbours deviate to opposite sides, and the mean cancels this. A
-    single neighbour would not: circular fibres around a heart would then seem to line up best along radii.
+    single neighbour would not suffice: circular fibres around a heart would then seem to line up best along radii.
     """
     steps = directions / spacing
     steps = np.rint(steps / np.abs(steps).max(axis=1, keepdims=True)).astype(int)
@@ -174,15 +174,14 @@ OPEN_FRAME = (
 
 
 def questions(volume: TensorVolume) -> tuple[str, ...]:
-    """Check tensors for a wrong frame or unit, and return the questions "Wrong frame?", "Wrong unit?" and similar.
+    """Check tensors for a wrong frame or unit; return questions such as "Wrong unit?", each with a remedy.
 
     Reflected or rotated tensors are still positive definite, but fibres of neighbouring voxels do not line up. The
     function therefore computes the mean angle between a principal direction and those of the two neighbours along it,
-    and compares the angle for several frames. This needs about a thousand anisotropic voxels; set the mask first.
+    and compares the angle for several frames. The comparison needs about 1000 anisotropic voxels; set the mask first.
 
     If lengths are in mm, the function also checks that the size of the voxels is usual for scans, and that the median
-    mean diffusivity occurs in living tissue.
-    Each question comes with a remedy. For a slice, only the units are checked.
+    mean diffusivity occurs in living tissue. For a slice, only the units are checked.
 
     Examples:
         >>> volume = hj.io.TensorVolume(np.array(field.tensors), (2.0, 2.0), (0.0, 0.0), length_unit="mm")
@@ -193,7 +192,7 @@ def questions(volume: TensorVolume) -> tuple[str, ...]:
 
 
 def reviewed(volume: TensorVolume) -> tuple[TensorVolume, tuple[str, ...]]:
-    """Return the questions, and the volume with a note about its fibres in place of the note about its frame."""
+    """Return the volume, with a note about its fibres in place of the note `OPEN_FRAME`, and its `questions`."""
     found = coherence(volume) if volume.length_unit == "mm" else None
     notes = [note for note in volume.notes if note != OPEN_FRAME]
     wrong_frame, settled = "", False

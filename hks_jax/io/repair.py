@@ -33,11 +33,11 @@ REPAIRS: dict[str, str] = {
 """The methods of repair, with descriptions for messages."""
 
 _SAME, _TINY, _FILLED = 1e-6, 1e-6, 0.2
-"""The tolerances for equal and for zero tensors, both relative, and the least share of voxels in the background."""
+"""The relative tolerances for equal tensors and for zero tensors, and the least share of voxels in the background."""
 
 
 def find_invalid(volume: TensorVolume, floor: float | None = None) -> Bool[np.ndarray, "*shape"]:
-    """Return the voxels inside whose tensor is not finite, not positive definite, or has an eigenvalue < `floor`.
+    """Return the voxels inside the mask whose tensor is not finite or has an eigenvalue that is ≤ 0 or < `floor`.
 
     Examples:
         >>> volume = hj.io.TensorVolume(np.array(field.tensors), (1.0, 1.0), (0.0, 0.0))
@@ -54,13 +54,8 @@ def find_invalid(volume: TensorVolume, floor: float | None = None) -> Bool[np.nd
     return bad
 
 
-def find_unsymmetric(volume: TensorVolume) -> Bool[np.ndarray, "*shape"]:
-    """Return the voxels inside whose tensor is unsymmetric beyond rounding, as `hks_jax.TensorField` defines it."""
-    return volume.inside & unsymmetric(volume.tensors)
-
-
 def require_valid(volume: TensorVolume, argument: str = "repair") -> None:
-    """Raise ValueError if tensors inside are not positive definite, with their number, the first one and remedies."""
+    """Raise ValueError with remedies if tensors inside the mask of a volume are not positive definite."""
     bad = find_invalid(volume)
     if bad.any():
         tensors = volume.tensors[bad]
@@ -87,7 +82,7 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
             ``"mask"`` removes their voxels from the mask. ``"nearest"`` replaces each by the tensor of the nearest
             valid voxel in space.
         floor: the least admissible eigenvalue, in the tensors' unit. If None, all positive eigenvalues are admissible,
-            and ``"clip"`` uses 1 % of the median, over valid tensors, of the mean eigenvalue.
+            and ``"clip"`` uses 1 % of the median of the valid tensors' mean eigenvalues.
 
     Returns:
         The volume. Its ``repair`` contains the method, the floor, the number of repaired voxels and of all voxels, the
@@ -95,8 +90,8 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
         summarises this.
 
     Raises:
-        ValueError: the method is unknown, the floor is not positive, no tensor is valid, or ``"clip"`` meets NaN or
-            infinite tensors.
+        ValueError: the method is unknown, the floor is not positive, no tensor is valid, or a tensor is NaN or infinite
+            and the method is ``"clip"``.
 
     Examples:
         >>> tensors = np.array(field.tensors)
@@ -165,7 +160,7 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
 
 
 def _why_so_many(volume: TensorVolume, finite: Float[np.ndarray, "n d d"]) -> str:
-    """Return a possible reason for many invalid tensors, such as a wrong order; `finite` holds their finite ones."""
+    """Return a possible reason for many invalid tensors, such as a wrong order; `finite` has the finite ones."""
     question = "" if volume.invalid_by_order is None else volume.invalid_by_order.question
     if question or not len(finite):
         return question or "Noise does not explain this number. Programs often write NaN outside a mask"
@@ -189,7 +184,7 @@ def without_background(volume: TensorVolume) -> TensorVolume:
 
 
 def find_background(volume: TensorVolume) -> tuple[Bool[np.ndarray, "*shape"], str] | None:
-    """Return the voxels that a program seems to have filled as background, and a sentence; None if there are few.
+    """Return the voxels that a program filled as background, and a sentence about them; None if there are few.
 
     Measured tensors are never exactly isotropic and equal to one another, and never a million times smaller than the
     others. Programs such as ANTs write such tensors where there is no signal. The result is None for a volume with a
@@ -226,7 +221,7 @@ def find_background(volume: TensorVolume) -> tuple[Bool[np.ndarray, "*shape"], s
 
 
 def positive_tensors(volume: TensorVolume, how: PositiveMap, number: float) -> TensorVolume:
-    """Map all tensors S inside, such as stresses, to positive definite ones, and return the volume.
+    """Map all tensors S inside the mask, such as stresses, to positive definite ones, and return the volume.
 
     ``"exp"`` computes exp(S/number), and ``"shift"`` computes S + number·I, as `hks_jax.TensorField.from_indefinite`
     does. The mapped tensors are a metric, so continue with ``metric="tensor"``.
@@ -256,8 +251,8 @@ def positive_tensors(volume: TensorVolume, how: PositiveMap, number: float) -> T
 
 def require_symmetric(volume: TensorVolume) -> None:
     """Raise ValueError if a tensor is unsymmetric, for formats that store only one half of each tensor."""
-    if unsymmetric := int(find_unsymmetric(volume).sum()):
+    if count := int((volume.inside & unsymmetric(volume.tensors)).sum()):
         raise ValueError(
-            f"volume: got {unsymmetric} unsymmetric tensors, but this format stores only one half of a tensor. Write "
+            f"volume: got {count} unsymmetric tensors, but this format stores only one half of a tensor. Write "
             "the symmetric parts (T + Tᵀ)/2, or use .npz or .vti"
         )

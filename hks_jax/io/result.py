@@ -14,7 +14,6 @@ from jaxtyping import Float
 from hks_jax import Grid, SurfaceMesh, TetMesh
 from hks_jax.arrays import describe_array
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
-from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.io.arrays import volume_of
 from hks_jax.io.files import save
 from hks_jax.io.units import median_mean_diffusivity
@@ -29,7 +28,7 @@ class Result:
     """A signature or another scalar field on a mesh, or on a volume or slice whose mask is the domain.
 
     Attributes:
-        place: the volume, slice or mesh. If a file has no tensors, those of the volume are the identity.
+        place: the volume, slice or mesh. If the result's file has no tensors, the volume has identity matrices.
         values: (n_times, *shape).
         times: (n_times,), or (0,) for a result without times.
         eigenvalues: (k,), or (0,) if they are unknown.
@@ -181,7 +180,7 @@ class Result:
 
     @property
     def z(self) -> Float[np.ndarray, "n_times *shape"] | None:
-        """The difference from flat space or, for other normalisations, from the median, in standard deviations."""
+        """The difference from flat space (raw, flat) or the median (other normalisations), in standard deviations."""
         if "deviation" not in self.arrays:
             return None
         flat = {"raw": 1 / self.flat_scale, "flat": 1.0}
@@ -202,20 +201,14 @@ class Result:
 
     @property
     def length_unit(self) -> str:
-        """The unit of lengths: mm for a volume with an affine, otherwise that of the volume, which may be empty."""
+        """The unit of lengths: mm for a volume with an affine, empty for a mesh, otherwise the volume's unit."""
         place = self.place
         return "" if not isinstance(place, TensorVolume) else place.length_unit if place.affine is None else "mm"
 
 
 def signature_file(result: Path) -> Path:
-    """Return the signature's file in a folder that ``hks-jax hks`` wrote; return any other path unchanged."""
+    """Return the path of the signature in a folder that ``hks-jax hks`` wrote; return any other path unchanged."""
     return result / "hks.npz" if result.is_dir() else result
-
-
-def recorded_boundary(settings: Mapping[str, Any]) -> BoundarySpec | None:
-    """Return the boundary in settings from JSON, with tuples in place of lists, or None."""
-    boundary: BoundarySpec | None = tuples(settings.get("boundary"))
-    return boundary
 
 
 def tuples(value: Any) -> Any:

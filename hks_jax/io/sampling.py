@@ -47,9 +47,8 @@ def sample_tensors(volume: TensorVolume, points: Any) -> Float[np.ndarray, "n 3 
     lost = ~(weights > 1e-9)
     if lost.any():
         ends = [
-            f"{low.round(1).tolist()} … {high.round(1).tolist()}"
+            f"{x.min(axis=0).round(1).tolist()} … {x.max(axis=0).round(1).tolist()}"
             for x in (places, np.argwhere(inside) @ linear.T + origin)
-            for low, high in [(x.min(axis=0), x.max(axis=0))]
         ]
         raise ValueError(
             f"points: got {int(lost.sum())} of {len(places)} points without a voxel inside the mask around them (the "

@@ -17,7 +17,7 @@ def write_table(
 ) -> list[Path]:
     """Write a table and, if `about` is given, a JSON file beside it; return the paths.
 
-    Both files are written atomically, the JSON file last, so its existence implies that of the table.
+    Both files are written atomically, the JSON file last, so if the JSON file exists, the table does.
     """
     written = [path]
     with atomic_path(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as stream:
@@ -29,7 +29,7 @@ def write_table(
 
 
 def cell(value: Any) -> str:
-    """Return a value as one line without tabs: nine digits of a number, ``n/a`` for None, NaN, infinity and ``""``."""
+    """Return a value as text without tabs: a number with nine digits, None, NaN, infinity and ``""`` as ``n/a``."""
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return MISSING
     return f"{value:.9g}" if isinstance(value, float) else " ".join(str(value).split()) or MISSING
@@ -52,7 +52,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_table(path: Path) -> list[dict[str, str]]:
-    """Return the rows of a table with a header; commas separate the cells of a ``.csv`` file, tabs those of any other.
+    """Return the rows of a table with a header; cells are separated by commas in a ``.csv`` file, otherwise by tabs.
 
     Empty rows are left out, and so are cells that are empty or ``n/a``.
     """

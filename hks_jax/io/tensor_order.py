@@ -1,8 +1,8 @@
 """The orders in which programs store the components of a symmetric tensor, and the axes of the components.
 
 The same numbers represent different tensors in programs that differ in the order or the axes. The three components of
-a 2×2 tensor have the same sequence as among the six. NRRD's kinds of matrix have xx xy xz yy yz zz, along the axes of
-the measurement frame.
+a 2×2 tensor have the same sequence as among the six of a 3×3 tensor. NRRD's kinds of matrix have the order
+xx xy xz yy yz zz, along the axes of the measurement frame.
 """
 
 import math
@@ -73,13 +73,13 @@ def fsl_signs(linear: Float[np.ndarray, "d d"]) -> Float[np.ndarray, " d"]:
 
 
 def nearest_rotation(linear: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
-    """Return the rotation or reflection nearest to the matrix with normalised columns."""
+    """Normalise the columns of a matrix, and return the nearest rotation or reflection."""
     u, _, vt = np.linalg.svd(linear / np.linalg.norm(linear, axis=0))
     return u @ vt
 
 
 def _indices(order: str, d: int) -> list[tuple[int, int]]:
-    components = ORDERS["fsl" if order == "nrrd" else order]  # NRRD has FSL's sequence
+    components = ORDERS["fsl" if order == "nrrd" else order]  # NRRD has FSL's order of components
     pairs = [("xyz".index(pair[0]), "xyz".index(pair[1])) for pair in components]
     return [pair for pair in pairs if max(pair) < d]
 
@@ -89,7 +89,7 @@ _SAMPLE = 20_000
 
 
 class InvalidByOrder(NamedTuple):
-    """For each order of components, the number of a file's tensors that would not be positive definite."""
+    """The number of a file's tensors that would not be positive definite in each order of components."""
 
     order: str  # the order in which the tensors were read
     counts: dict[str, int]  # the number of invalid tensors for each order
@@ -97,7 +97,7 @@ class InvalidByOrder(NamedTuple):
 
     @property
     def fewer(self) -> list[str]:
-        """The orders with less than half as many invalid tensors, best first."""
+        """The orders with less than half as many invalid tensors as `order`, best first."""
         own = self.counts[self.order]
         return sorted((name for name in self.counts if 2 * self.counts[name] < own), key=self.counts.__getitem__)
 
@@ -114,9 +114,9 @@ class InvalidByOrder(NamedTuple):
 
 
 def invalid_by_order(components: Float[np.ndarray, "*shape n"], order: str) -> InvalidByOrder | None:
-    """Count the tensors that are not positive definite in each order; return None if few are in the order `order`.
+    """Count the tensors that are not positive definite in each order; return None if few are invalid in `order`.
 
-    The axes of the components have no influence. The counts hardly distinguish ``"mrtrix"`` from ``"vtk"``, which
+    The counts do not depend on the axes of the components. They hardly distinguish ``"mrtrix"`` from ``"vtk"``, which
     differ by an exchange of two off-diagonal components.
     """
     rows = components.reshape(-1, components.shape[-1])
@@ -129,7 +129,7 @@ def invalid_by_order(components: Float[np.ndarray, "*shape n"], order: str) -> I
 
 
 class Matrices(NamedTuple):
-    """The tensors of a file, with components along the file's axes."""
+    """The tensors of a file, before their transformation to the voxel axes."""
 
     tensors: Float[np.ndarray, "*shape d d"]
     order: str  # the order of components; "matrix" for whole matrices

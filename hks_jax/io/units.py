@@ -1,13 +1,11 @@
 """Units of lengths, which headers declare, and of diffusivities, which most headers do not declare."""
 
-import math
 import re
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
 
 from hks_jax.io.volume import TensorVolume
 
@@ -32,7 +30,7 @@ _PREFIXES = {
     **{"": 1e3, "centi": 10.0, "c": 10.0, "milli": 1.0, "m": 1.0, "nano": 1e-6, "n": 1e-6},
     **dict.fromkeys(("micro", "u", "\u00b5", "\u03bc"), 1e-3),  # the micro sign, and the Greek letter
 }
-"""The length in mm of a metre with each prefix."""
+"""For each prefix of the metre, the length in mm of the unit with this prefix."""
 
 
 def millimetres(where: str, text: str) -> float | None:
@@ -51,19 +49,9 @@ def by_axis(values: Iterable[float]) -> str:
     return " × ".join(f"{value:.5g}" for value in values)
 
 
-def scaled_beside(own: Float[np.ndarray, "4 4"], affine: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """Convert to mm the affine `own` of an image without a unit of length, which belongs to an image with `affine`.
-
-    Some programs lose the unit of masks and labels. The function chooses mm, m or µm for similar voxel sizes.
-    """
-    ratio = np.linalg.norm(affine[:3, :3]) / np.linalg.norm(own[:3, :3])
-    scale = min((1.0, 1e3, 1e-3), key=lambda s: abs(math.log(ratio / s)))
-    return np.diag([scale, scale, scale, 1.0]) @ own
-
-
 def in_mm2_per_s(volume: TensorVolume, unit: Unit) -> TensorVolume:
     """Return the volume with its tensors converted from `unit` to mm²/s."""
-    if unit not in get_args(Unit):
+    if unit not in UNITS:
         raise ValueError(f"unit: got {unit!r}; expected one of {', '.join(UNITS)}")
     if volume.unit:
         raise ValueError(f"unit: got {unit!r}, but {volume.source} declares {volume.unit}. Leave this argument out")
@@ -75,7 +63,7 @@ def in_mm2_per_s(volume: TensorVolume, unit: Unit) -> TensorVolume:
 
 
 def length_question(volume: TensorVolume) -> str:
-    """Return a question if no scan has voxels of this size in mm, or else the empty text."""
+    """Return a question if lengths are in mm and no scan has voxels of this size, or else the empty text."""
     low, high = _VOXELS
     if volume.length_unit != "mm" or all(low <= h <= high for h in volume.spacing):
         return ""

@@ -26,15 +26,15 @@ class Format:
     """A file format of images on grids. `hks_jax.io.formats` lists all formats; a new format is a new module."""
 
     names: tuple[str, ...]  # the suffixes of its files
-    read_tensors: Callable[..., "TensorVolume"]  # called with a name, the order, the frame and the `options`
+    read_tensors: Callable[..., "TensorVolume"]  # called with a path, an order, a frame and the `options`
     options: tuple[str, ...] = ()  # further arguments of `hks_jax.io.read_tensors` that the format accepts
-    # Reads masks and labels: from a path and the affine of the related image, it returns values and their own affine.
-    read_image: Callable[..., tuple[np.ndarray, np.ndarray | None]] | None = None
+    # Reads masks and labels; returns voxel values, their affine or None, and the declared unit of length, or "".
+    read_image: Callable[[str], tuple[np.ndarray, np.ndarray | None, str]] | None = None
     written: tuple[str, ...] = ()  # the suffixes that can be written
     # Writes results; called with a path, an array, the volume, the array's name, more arrays and the provenance.
     write: Callable[[Path, np.ndarray, "TensorVolume", str, dict[str, Any], str], None] | None = None
     write_tensors: Callable[[Path, "TensorVolume", Mapping[str, Any] | None], None] | None = None
-    image: str = ""  # the suffix of result images for tensors in this format; empty if only an npz is written
+    image: str = ""  # the suffix of images of results, for tensors in this format; empty if results are only npz
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,23 +46,24 @@ class TensorVolume:
         spacing: the distance between voxels along each axis.
         origin: the coordinates of voxel (0, …, 0) on the grid; the affine gives its position in space.
         mask: bool (*shape), or None for all voxels.
-        affine: (4, 4), the map from voxel indices to world coordinates, or None. The affine of a slice belongs to a
-            volume one voxel thick.
+        affine: (4, 4), the map from voxel indices to world coordinates, or None. A slice has the affine of a volume one
+            voxel thick.
         slice_axis: for a slice, the axis of the volume perpendicular to it; None for a volume.
         order: the order of components in the file, or ``"matrix"`` for whole matrices.
         frame: the axes of the components in the file.
-        notes: sentences about decisions of the reader.
+        notes: sentences about decisions made while the file was read.
         source: the path of the file.
         digest: the SHA-256 of the file; empty if the data are in several files.
         repair: a report of the repair of tensors that are not positive definite; empty without repair.
         invalid_by_order: for each order of components, the number of tensors that would not be positive definite; None
-            if few are in `order`.
-        length_unit: ``"mm"`` if the file declares a unit, from which lengths are converted; otherwise empty.
-        unit: ``"mm²/s"`` if the tensors' unit is known, as an argument or from a fit; otherwise empty.
+            if nearly all are positive definite in `order`.
+        length_unit: ``"mm"`` if the file's unit of length is known, so that lengths are in mm; otherwise empty.
+        unit: ``"mm²/s"`` if the tensors' unit is known (from an argument, a fit or the file); otherwise empty.
         covariance: (*shape, m, m), the covariance of the components xx xy yy (xz yz zz) along the voxel axes, in the
             squared unit of the tensors, if known (`fit_dwi`); otherwise None.
         modes: (*shape, n, m), the contribution of each of the n images to the noise of these components, if the noise
-            was estimated from residuals (`fit_dwi`, in float32); otherwise None. Modes include noise that voxels share.
+            was estimated from residuals (`fit_dwi`, in float32); otherwise None. Unlike the covariance, modes also
+            describe noise that is correlated between voxels.
 
     Raises:
         ValueError: shapes disagree, a spacing is not positive, or a number is not finite.
@@ -108,7 +109,7 @@ class TensorVolume:
         if mask is not None and (mask.shape != shape or mask.dtype != bool):
             raise ValueError(f"{where}mask: got shape {mask.shape}, {mask.dtype}; expected booleans of shape {shape}")
         if self.affine is not None and (self.affine.shape != (4, 4) or not np.isfinite(self.affine).all()):
-            raise ValueError(f"{where}affine: got shape {self.affine.shape}; expected (4, 4), finite")
+            raise ValueError(f"{where}affine: got shape {self.affine.shape}; expected finite numbers of shape (4, 4)")
         if covariance is not None and covariance.shape != (*shape, *[d * (d + 1) // 2] * 2):
             raise ValueError(f"{where}covariance: got shape {covariance.shape}; expected (*shape, m, m), m = d(d+1)/2")
 
@@ -183,13 +184,13 @@ class TensorVolume:
         return replace(self, **cut, slice_axis=a, notes=(*self.notes, note))
 
     def noise(self, grid: Grid) -> TensorNoise:
-        """Return the noise that the fit of the tensors estimated (`fit_dwi`), by images if `modes` are known.
+        """Return the noise of the tensors that `fit_dwi` estimated, from `modes` if they are known, else `covariance`.
 
         Raises:
             ValueError: the fit did not estimate the noise.
         """
         if self.modes is not None:
-            return TensorNoise.from_modes(self.modes, grid, unknowns=7)  # the tensor and the unweighted signal
+            return TensorNoise.from_modes(self.modes, grid, unknowns=7)  # six components and the unweighted signal
         if self.covariance is None:
             raise ValueError(
                 "noise: got a volume without an estimate of its noise; fit the tensors by `fit_dwi` with noise=, or "
@@ -215,7 +216,7 @@ class TensorVolume:
 
 
 def placed(name: str, found: Matrices, frame: str, affine: Float[np.ndarray, "4 4"], **known: Any) -> TensorVolume:
-    """Return a volume with an affine, after transforming the tensors from the axes of `frame` to the voxel axes."""
+    """Return a volume at the position `affine`, with tensors transformed from the axes of `frame` to the voxel axes."""
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
     if not (np.isfinite(affine).all() and spacing.min() > 0):
         raise ValueError(f"{name}: got an affine that is singular or not finite; expected an invertible affine")
@@ -234,13 +235,13 @@ def placed(name: str, found: Matrices, frame: str, affine: Float[np.ndarray, "4 
 
 
 def corners(shape: tuple[int, ...]) -> Int[np.ndarray, "8 4"]:
-    """Return the indices of the voxels at the corners of an image in 2D or 3D as homogeneous coordinates."""
+    """Return the homogeneous indices (i, j, k, 1) of the voxels at the corners of an image in 2D or 3D."""
     ends = ((0, n - 1) for n in (*shape, 1)[:3])
     return np.stack(np.meshgrid(*ends, [1], indexing="ij"), -1).reshape(-1, 4)
 
 
 def images_of(array: np.ndarray, volume: TensorVolume) -> np.ndarray:
-    """Return scalars (*shape,) or (n_times, *shape) for image files, with slices one voxel thick and times last."""
+    """Return scalars (*shape,) or (n_times, *shape) as image files store them: slices one voxel thick, times last."""
     n = array.ndim - volume.dimension
     if volume.dimension == 2:
         array = np.expand_dims(array, n + volume.thin_axis)
@@ -254,7 +255,7 @@ def digest(path: str | os.PathLike[str]) -> str:
 
 
 def describe(volume: TensorVolume | None, more: Mapping[str, Any] | None) -> str:
-    """Return a record in one line of JSON: the version, the tensors' file, the reader's notes, and `more`."""
+    """Return a line of JSON with the origin of data: the version, the tensors' file, the volume's notes, and `more`."""
     record: dict[str, Any] = {"software": f"hks-jax {__version__}"}
     if volume is not None:
         record |= {"source": volume.source, "sha256": volume.digest, "order": volume.order, "frame": volume.frame}
@@ -265,14 +266,14 @@ def describe(volume: TensorVolume | None, more: Mapping[str, Any] | None) -> str
 
 
 def describe_tensors(volume: TensorVolume, order: str, frame: str, more: Mapping[str, Any] | None) -> str:
-    """Return the record of written tensors, with their order, frame, axes and units in the new file."""
+    """Return a line of JSON with the origin of tensors, and their order, frame, axes and units in the new file."""
     stored = {"order": order, "frame": frame, "source_order": volume.order, "source_frame": volume.frame}
     stored |= {"axes": volume.volume_affine[:3, :3].tolist(), "length_unit": volume.length_unit, "unit": volume.unit}
     return describe(volume, {**stored, **(more or {})})
 
 
 def own_record(text: str | bytes) -> dict[str, Any]:
-    """Return the record that `describe_tensors` wrote, or an empty one for any other text."""
+    """Parse a text that `describe_tensors` wrote; return an empty dictionary for any other text."""
     try:
         record = json.loads(text.rstrip(b"\0") if isinstance(text, bytes) else text)
     except ValueError:

@@ -21,9 +21,9 @@ from hks_jax.optional import optional
 from hks_jax.storage import atomic_path, existing, load_npz, reading
 
 _ROOM, _RATIO = 8 << 30, 200
-"""The limit of memory for reading a file, in bytes, and its increase per byte of the file."""
+"""The limit of memory for reading an empty file, in bytes, and the increase of the limit per byte of a file."""
 _PATIENCE, _SPEED = 60.0, 1e6
-"""The limit of time for reading a file, in seconds, and the bytes of the file that add one second."""
+"""The limit of time for reading an empty file, in seconds, and the number of bytes that increase it by 1 s."""
 
 
 def holds_dataset(path: str | os.PathLike[str], kind: str) -> bool:
@@ -103,7 +103,7 @@ def _write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, An
 
 
 def by_time(name: str, array: np.ndarray, n: int, extra: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return `array` under its name if n = 0, or one array per time under names with the time if n = 1."""
+    """Return the array by its name if n = 0, or one array per time, with the time in its name, if n = 1."""
     if n == 0:
         return {name: array}
     times = np.ravel(extra.get("times", ()))
@@ -171,10 +171,10 @@ def _check_pieces(content: bytes) -> None:
 
 
 def _check_range(content: bytes, array: str, values: np.ndarray) -> None:
-    """Raise ValueError if the norms of an array's rows contradict the range that the file declares, if it does."""
+    """Raise ValueError if the file declares a range of the array that its values and its rows' norms do not have."""
     tag = re.search(rb"<DataArray\b[^>]*\bName=\"" + re.escape(array.encode()) + rb"\"[^>]*>", content)
     told = [float(word) for word in re.findall(rb"\bRangeM(?:in|ax)=\"([^\"]+)\"", tag[0])] if tag else []
-    if len(told) < 2 or np.isnan(values).any() or b"vtkGhostType" in content[:10_000]:  # the range omits ghosts
+    if len(told) < 2 or np.isnan(values).any() or b"vtkGhostType" in content[:10_000]:  # the range omits ghost values
         return
     with np.errstate(over="ignore"):
         lengths = np.linalg.norm(values, axis=-1)
@@ -190,14 +190,14 @@ def _check_length(content: bytes, array: str, values: np.ndarray) -> None:
     key = re.escape(quote(array).encode())
     line = re.search(rb"\n(?:(?:TENSORS6?|SCALARS) " + key + rb" \w+.*|" + key + rb" \d+ \d+ \w+.*)\n", content)
     if line is None:
-        return  # the array's start is not found, because its name is written differently
+        return  # the array is not found, because its name is written differently
     rest, text = content[line.end() :], b"ASCII" in content.split(maxsplit=40)[:40]
     if len(rest.split(maxsplit=values.size)) < values.size if text else len(rest) < values.nbytes:
         raise ValueError(f"the file ends before the end of the array {array!r}; expected {values.size} values")
 
 
 def _tensor_array(name: str, image: Mapping[str, np.ndarray], wanted: str | None) -> tuple[str, str, bool]:
-    """Return the place (point or cell) and the name of the array of tensors, and whether the file declares it so."""
+    """Return the place (point or cell) and name of the array to read, and whether the file declares it as tensors."""
     for place in ("point", "cell"):
         arrays = {key.partition(":")[2]: a for key, a in image.items() if key.startswith(f"{place}:")}
         tensors = [n for n, a in arrays.items() if a.ndim == 2 and a.shape[1] in (6, 9) and wanted in (None, n)]
@@ -212,7 +212,7 @@ def _tensor_array(name: str, image: Mapping[str, np.ndarray], wanted: str | None
     asked = "" if wanted is None else f" named {wanted!r}"
     raise ValueError(
         f"{name}: got the arrays (components) {listed}; expected one array of 6 or 9 components{asked}. Pass "
-        "array, the name of the one to read"
+        "array, the name of the array to read"
     )
 
 
@@ -222,9 +222,9 @@ def _on_grid(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _as_plane(volume: TensorVolume) -> TensorVolume:
-    """Return an image one voxel thick as a slice if its tensors vanish across the plane."""
+    """Return an image one voxel thick as a slice, if all components of its tensors across the plane are zero."""
     size = np.abs(volume.tensors).max()
-    rounding = 100 * np.finfo(volume.tensors.dtype).eps * size  # from the rotation to voxel axes
+    rounding = 100 * np.finfo(volume.tensors.dtype).eps * size  # due to the rotation to the voxel axes
     for axis in range(3):
         if volume.shape[axis] == 1 and size > 0 and np.abs(volume.tensors[..., axis, :]).max() <= rounding:
             plane = volume.slice(("x", "y", "z")[axis], 0)

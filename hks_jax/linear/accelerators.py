@@ -1,6 +1,6 @@
 """Decisions that depend on whether computations run on an accelerator.
 
-On an accelerator, each kernel launch takes at least about 4 µs. A host that reads a number waits for all earlier
+On an accelerator, each kernel launch takes at least about 4 µs. If the host reads a number, it waits for all earlier
 kernels. So programs for accelerators have few kernels and static loop lengths, at the cost of additional arithmetic.
 """
 
@@ -24,7 +24,7 @@ def at_hand() -> bool:
 
 
 def kernels_compile() -> bool:
-    """Return whether Pallas kernels compile for this machine's GPU; False without a GPU, because tracing takes time."""
+    """Return whether Pallas kernels compile for this machine's GPU; False if there is no GPU."""
     if jax.default_backend() != "gpu":
         return False
     try:
@@ -36,7 +36,7 @@ def kernels_compile() -> bool:
 
 
 INTERPRETED = False
-"""Whether Pallas interprets its kernels by XLA operations on any device, for tests."""
+"""Whether Pallas interprets kernels by XLA operations, which any device supports; for tests."""
 
 _PROVED: dict[tuple[str, str], bool] = {}
 
@@ -54,7 +54,7 @@ def kernels_agree(name: str, dtype: Any, compare: Callable[[], Iterable[tuple[An
     key = name, np.dtype(dtype).name
     if key not in _PROVED:
         try:
-            with ThreadPoolExecutor(1) as pool:  # a separate thread computes, even while this one traces
+            with ThreadPoolExecutor(1) as pool:  # a separate thread can compute while this thread traces
                 results = pool.submit(lambda: [tuple(map(np.asarray, pair)) for pair in compare()]).result()
             error = np.max([np.max(np.abs(found - right)) / np.max(np.abs(right)) for found, right in results])
             failure = "" if error <= float(np.finfo(dtype).eps) ** 0.6 else f"have a relative error of {error:.1e}"
@@ -72,13 +72,13 @@ def kernels_agree(name: str, dtype: Any, compare: Callable[[], Iterable[tuple[An
 
 
 def padded_size(n: int, least: int) -> int:
-    """Return the smallest power of two ≥ n and ≥ ``least``, itself a power of two; Triton arrays need such sizes."""
+    """Return the smallest power of two that is at least n and at least ``least``, as Triton requires of array sizes."""
     return max(least, 1 << (n - 1).bit_length())
 
 
 def row_by_row(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the array; on accelerators, force row-major memory layout.
+    """Return the array, on accelerators in row-major memory layout.
 
-    Otherwise, if only the transpose of a part is needed, XLA transposes the whole array on accelerators.
+    Without this constraint, XLA transposes a whole array if it needs the transpose of a part.
     """
     return with_layout_constraint(x, Layout(major_to_minor=tuple(range(x.ndim)))) if at_hand() else x

@@ -23,10 +23,10 @@ _CELL = 50
 """The largest number of vertices in a cell; larger cells are divided. With cells of 25, solves take longer."""
 _LANDMARKS = 8
 _SMOOTHING = 6
-"""The number of times that distances are averaged with those of neighbours, because many integer distances are equal.
-Measured on random closed surfaces, the factors are then as large as with the vertices' positions as coordinates. They
-are 3 to 8 % larger than with METIS, whose nested dissection takes about as long; a factorisation takes 12 to 28 % more
-operations."""
+"""The number of times that each vertex's distances are averaged with its neighbours' distances, because many integer
+distances are equal. On random closed surfaces, the factors then have as many entries as with the vertices' positions as
+coordinates. They are 3 to 8 % larger than with METIS, whose nested dissection takes about as long; a factorisation
+takes 12 to 28 % more operations."""
 
 
 Ints = Int[np.ndarray, " _"]
@@ -37,7 +37,7 @@ class Parts(NamedTuple):
 
     # the level of the separator that contains each vertex; vertices of the undivided cells have the last level
     level: Int[np.ndarray, " n"]
-    part: Int[np.ndarray, " n"]  # the index, within that level, of the part whose separator (or cell) it is in
+    part: Int[np.ndarray, " n"]  # the number, in its level, of the part whose separator (or cell) has the vertex
     depth: int  # the number of levels
 
 
@@ -90,7 +90,7 @@ def _coordinates(graph: csr_matrix) -> Float[np.ndarray, "n c"]:
     """Return distances from landmarks in each component; an additional coordinate places components in sequence."""
     n = graph.shape[0]
     count, label = connected_components(graph, directed=False)
-    # The first landmark is the first vertex in the order, which is far from the last; all distances are below n.
+    # The first landmark is the first vertex in the banded order, which is far from the last. Distances are below n.
     nearest, roots = np.arange(2 * n, n, -1), np.empty(count, int)
     distances: list[Int[np.ndarray, " n"]] = []
     for _ in range(_LANDMARKS):
@@ -148,7 +148,7 @@ def _along_axes(x: Float[np.ndarray, "n c"], q: Ints, counts: Ints) -> Ints:
 
 
 def within_groups(counts: Int[np.ndarray, " groups"]) -> Int[np.ndarray, " n"]:
-    """Return 0, 1, … within each of consecutive groups of the given sizes."""
+    """Return each element's index within its group, for consecutive groups of these sizes."""
     return np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
 
 

@@ -16,7 +16,7 @@ from hks_jax.linear.products import aligned, matmul
 
 _FAILURE = 1e-6
 _START = 30
-"""The assumed deviation of the start of `lanczos_bound` from a uniform one: above the root of the condition of PD."""
+"""A factor for the nonuniform start of `lanczos_bound`, which exceeds the square root of the condition number of PD."""
 
 Scalar = Float[Array, ""]
 Columns = Float[Array, "*shape b"]
@@ -92,7 +92,7 @@ def chebyshev_iteration(
 def chebyshev_heat_coefficients(
     times: Float[Array, " m"], top: Scalar | float, degree: int
 ) -> Float[Array, "m {degree}+1"]:
-    """Return the coefficients of exp(−tλ), by the cosine transform of samples, which JAX can differentiate."""
+    """Return the Chebyshev coefficients of exp(−tλ), by a cosine transform of samples, which JAX can differentiate."""
     samples = degree + 32 + 4 * math.isqrt(degree)  # aliases have indices ≥ 2·samples − degree
     angles = (np.arange(samples) + 0.5) * (np.pi / samples)
     weights = np.cos(np.outer(angles, np.arange(degree + 1))) * (2 / samples)
@@ -101,19 +101,18 @@ def chebyshev_heat_coefficients(
     return matmul(values, jnp.asarray(weights, times.dtype))
 
 
-def coefficient_sizes(z: float) -> Float[np.ndarray, " n"]:
-    """Return the absolute values of the coefficients of exp(−tλ), down to 1e-25."""
-    n = np.arange(int(math.sqrt(2 * z * 60) + 60) + 1)
-    return np.where(n == 0, 1, 2) * scipy.special.ive(n, z)
-
-
 def coefficient_tails(z: float) -> Float[np.ndarray, " n_and_1"]:
-    """Return the sums of the `coefficient_sizes` from each n on, and a final 0."""
-    return np.append(np.cumsum(coefficient_sizes(z)[::-1])[::-1], 0)
+    """Return, for each n, the sum of the absolute Chebyshev coefficients of exp(−tλ) from n on, where z = t·top/2.
+
+    Coefficients below 1e-25 are omitted. The last sum is 0.
+    """
+    n = np.arange(int(math.sqrt(2 * z * 60) + 60) + 1)
+    sizes = np.where(n == 0, 1, 2) * scipy.special.ive(n, z)
+    return np.append(np.cumsum(sizes[::-1])[::-1], 0)
 
 
 def least_degree(z: float, error: float) -> int:
-    """Return the least degree ≥ 1 at which the truncated coefficients sum to at most the error."""
+    """Return the least degree ≥ 1 for which the omitted coefficients sum to at most the error."""
     return max(int(np.argmax(coefficient_tails(z) <= error)) - 1, 1)
 
 
@@ -132,10 +131,10 @@ def lanczos_bound(
 ) -> Scalar:
     """Return an upper bound of the eigenvalues of PK by Lanczos iteration.
 
-    From a random start, the largest Ritz value θ of k steps satisfies λ(1 − ε) ≤ θ ≤ λ with probability at least
-    1 − 1.648 √n exp(−√ε (2k − 1)) (Kuczyński and Woźniakowski 1992, theorem 4.2). The result is θ/(1 − ε) for the ε at
-    which the probability of failure is 10⁻⁶. The start is normally distributed with respect to D instead of P⁻¹; a
-    safety factor accounts for the difference.
+    From a random start, the largest Ritz value θ of k steps and the largest eigenvalue λ satisfy λ(1 − ε) ≤ θ ≤ λ with
+    probability at least 1 − 1.648 √n exp(−√ε (2k − 1)) (Kuczyński and Woźniakowski 1992, theorem 4.2). The result is
+    θ/(1 − ε) for the ε at which the probability of failure is 10⁻⁶. The start is normally distributed with respect to D
+    instead of P⁻¹; a safety factor accounts for the difference.
     """
     r = jnp.sqrt(sums) * jax.random.normal(jax.random.key(0), sums.shape, sums.dtype)
 

@@ -1,8 +1,8 @@
 """Kernels for CUDA devices that fuse the operations of block Lanczos on blocks of a few long columns.
 
-By XLA operations, inner products and the combinations that use them take four launches: for partial sums, their sum, a
-small matrix computed from the sum, and combinations of columns. In this module, the partial sums are the input of a
-second kernel. Each of its programs adds the partial sums, computes the small matrix, and combines its own rows.
+With XLA operations, inner products and the combinations that use them take four launches: for partial sums, their sum,
+a small matrix computed from the sum, and combinations of columns. In this module, the partial sums are the input of a
+second kernel. Each program of this kernel adds the partial sums, computes the small matrix, and combines its own rows.
 """
 
 from collections.abc import Callable
@@ -82,10 +82,10 @@ def remainder(x: Block, block: Block, parts: Parts, before: tuple[Block, Small] 
 
 
 def orthonormal(parts: Parts, columns: tuple[Block, ...], before: Small) -> tuple[tuple[Block, ...], Small]:
-    """Return columns times F⁻ᵀ, and ``before`` times F, where FFᵀ = G, given partial sums of G (at most 32 rows).
+    """Return columns times F⁻ᵀ, and ``before`` times F, where FFᵀ = G, given partial sums of G; G has at most 32 rows.
 
-    If G = xᵀMx, the columns of xF⁻ᵀ are M-orthonormal. F is a pivoted Cholesky factor after scaling to unit diagonal.
-    Pivots below the level of rounding, which belong to linearly dependent columns, are raised to that level.
+    If G = xᵀMx, the columns of xF⁻ᵀ are M-orthonormal. F is computed by pivoted Cholesky factorisation of G, scaled to
+    unit diagonal. Pivots below rounding level, which belong to linearly dependent columns, are raised to this level.
     """
     b = len(before)
     floor = b * float(jnp.finfo(before.dtype).eps)
@@ -136,7 +136,8 @@ def _combined(
     wanted: int,
     name: str,
 ) -> tuple[tuple[Block, ...], Small]:
-    """Return linear combinations of blocks, and a small matrix; ``small`` computes both coefficients and matrix."""
+    """Return combinations of blocks, and a small matrix; ``small`` computes coefficients and matrix from the parts'
+    sum."""
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
@@ -217,7 +218,7 @@ def _product(x: Float[Array, "m s"], y: Float[Array, "s s"]) -> Float[Array, "m 
 
 
 def _pivoted_cholesky(a: Small, floor: float, rank: int) -> tuple[Small, Small]:
-    """Return F with FFᵀ = A, except for pivots raised to ``floor``, and F⁻ᵀ; the first ``rank`` columns of both.
+    """Return the first ``rank`` columns of F with FFᵀ = A, and of F⁻ᵀ; pivots below ``floor`` are raised to it.
 
     Let p be the k-th pivot row. Since F[p, j] = 0 for j > k, column p of CFᵀ = I gives the k-th column of C = F⁻ᵀ:
     F[p, k] C[:, k] = e_p − Σ_{j<k} F[p, j] C[:, j].

@@ -28,8 +28,8 @@ class Solution(NamedTuple):
     p: Float[Array, "n b"]  # the next search directions
     first: Float[Array, " b"]  # the initial rᵀz
     energy: Float[Array, " b"]  # the current rᵀz
-    change: Float[Array, " b"]  # the ratio of rᵀz to that of the previous step
-    errors: Float[Array, " b"]  # estimated relative errors in units of the wanted ones; converged if at most 1
+    change: Float[Array, " b"]  # the ratio of rᵀz to rᵀz in the previous step
+    errors: Float[Array, " b"]  # estimated relative errors divided by the wanted errors; at most 1 if converged
     going: Bool[Array, " b"]  # whether each column continues
     fresh: Bool[Array, ""]  # whether the next step is the first, or the first after a restart
     starts: Int[Array, ""]  # the number of restarts
@@ -62,8 +62,8 @@ def conjugate_gradients(
         clean: the projection x ↦ Px on the subspace in which the Aᵢ are positive definite. If rounding has led x out of
             the subspace, an energy is not positive; then the iteration restarts from Px.
         orthogonal: whether to reorthogonalise residuals, for one ill-conditioned matrix with expensive products (b = 1,
-            JAX only). Then ``product(x, first)`` returns the right-hand side if ``first`` is true, so that their common
-            parts are compiled once; only the shape of ``rhs`` matters.
+            JAX only). Then ``product(x, first)`` returns the right-hand side if ``first`` is true, so that operations
+            common to it and to products are compiled once. Only the shape of ``rhs`` matters.
     """
     xp, n = rhs.__array_namespace__(), len(rhs)
 
@@ -94,11 +94,11 @@ def conjugate_gradients(
         x, r, again = state.x + wide * p, state.r - wide * image, begin
         kept = state.kept
         if kept is not None:
-            # In exact arithmetic rᵢᵀPrⱼ = 0, where P is the preconditioner. Rounding destroys this orthogonality once
-            # an extreme Ritz pair has converged, and the method then finds that eigenvector repeatedly. If eigenvalues
-            # decay over eight decades, this doubles the number of steps. If products are expensive and n is small,
-            # reorthogonalisation is cheaper (Paige 1971; Simon 1984). If the memory is full, the last place is
-            # overwritten, because the pairs that converged first need the early residuals.
+            # In exact arithmetic rᵢᵀPrⱼ = 0 for i ≠ j, where P is the preconditioner. Rounding destroys this
+            # orthogonality once an extreme Ritz pair has converged, and the method then finds that eigenvector
+            # repeatedly. If eigenvalues decay over eight decades, this doubles the number of steps. If products are
+            # expensive and n is small, reorthogonalisation is cheaper (Paige 1971; Simon 1984). If the memory is full,
+            # the last place is overwritten, because the pairs that converged first need the early residuals.
             at, root = jnp.clip(state.steps, 0, len(kept[0]) - 1), jnp.sqrt(state.energy)
             kept = kept[0].at[at].set(state.r[:, 0] / root), kept[1].at[at].set(state.z[:, 0] / root)
             r = r - matmul(kept[0].T, products_with_columns(kept[1], r))

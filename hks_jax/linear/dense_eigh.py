@@ -33,15 +33,15 @@ class DenseEigenpairs(NamedTuple):
 def eigh(A: Any, B: Any = None, *, multiplet_tolerance: float | None = None) -> DenseEigenpairs:
     """Compute all eigenpairs of Av = λv, or of Av = λBv, of dense symmetric matrices, differentiably.
 
-    First derivatives, forward and reverse, are never NaN. At multiple eigenvalues, derivatives of sums of f(λ) over all
-    equal eigenvalues, such as tr f(A), and of projectors on eigenspaces are exact. At a simple eigenvalue, derivatives
-    of the eigenvalue and the eigenvector are exact.
+    First derivatives, forward and reverse, are never NaN. Derivatives of simple eigenvalues and their eigenvectors are
+    exact. At multiple eigenvalues, derivatives of projectors on eigenspaces are exact, and so are derivatives of sums
+    of f(λ) that include all equal eigenvalues, such as tr f(A).
 
     A single eigenvector of a multiple eigenvalue has no derivative. The rule returns an eigenvector derivative without
-    rotation within the eigenspace, and a diagonal entry of VᵀȦV for each of the equal eigenvalues. **At a multiple
+    rotation within the eigenspace, and a diagonal entry of VᵀȦV as the derivative of each eigenvalue. **At a multiple
     eigenvalue, the derivative of V f(Λ) Vᵀ through V and Λ is therefore wrong: use `matrix_function`**, which is exact
-    everywhere. No rule for V and Λ could be exact: at A = I the derivative along Ȧ is f'(1) Ȧ, but Λ̇ and a rotation of
-    V give only the diagonal of VᵀȦV.
+    everywhere. No rule for V and Λ could be exact: at A = I the derivative of f(A) along Ȧ is f'(1) Ȧ, but Λ̇ and a
+    rotation of V give only the diagonal of VᵀȦV.
 
     Eigenvectors of nearly equal eigenvalues, and their derivatives, have errors of about ε|λ|/gap. Derivatives of
     functions of a whole cluster have the same errors, unless the gaps are below `multiplet_tolerance`.
@@ -52,13 +52,13 @@ def eigh(A: Any, B: Any = None, *, multiplet_tolerance: float | None = None) -> 
         A: (n, n), symmetric, float32 or float64. Derivatives are with respect to the symmetric part of A.
         B: (n, n), symmetric positive definite; None: the identity.
         multiplet_tolerance: eigenvalues count as equal in derivatives if they differ by less than this, relative to the
-            largest |λ|. None is 4nε, about the effect of rounding.
+            largest |λ|. None means 4nε, about the effect of rounding.
 
     Returns:
         (n,) eigenvalues, ascending, and (n, n) eigenvectors in columns.
 
     Raises:
-        ValueError: entries are not finite, complex, or of another precision; a matrix is not square, or the shapes
+        ValueError: entries are NaN, infinite, complex, or of another precision; a matrix is not square, or the shapes
             differ; a matrix is unsymmetric by more than √ε of its largest entry; B is not positive definite. Traced
             values are not checked: the result may be NaN, and the symmetric part is used.
 
@@ -84,7 +84,7 @@ def differentiable_eigh(tolerance: float | None, a: Matrix) -> tuple[Values, Mat
     return lapack.eigh(a)
 
 
-# From AV = VΛ and VᵀV = I, with G = VᵀȦV,
+# The equations AV = VΛ and VᵀV = I give, with G = VᵀȦV,
 #
 #     λ̇ᵢ = Gᵢᵢ,    V̇ = VΩ,    Ωᵢⱼ = Gᵢⱼ/(λⱼ − λᵢ) for i ≠ j.
 #
@@ -102,7 +102,7 @@ def _eigh_jvp(tolerance: float | None, primals: tuple[Array], tangents: tuple[Ar
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _inverse_gaps(tolerance: float | None, values: Values) -> Matrix:
-    """Return 1/(λⱼ − λᵢ). If λᵢ and λⱼ count as equal, return 0, or NaN without a tolerance (0 on the diagonal)."""
+    """Return 1/(λⱼ − λᵢ), with 0 on the diagonal; for equal eigenvalues return 0, or NaN if there is no tolerance."""
     gap, apart = _gaps(tolerance, values)
     equal = 0 if tolerance is not None else jnp.where(jnp.eye(len(values), dtype=bool), 0, jnp.nan)
     return jnp.where(apart, 1 / jnp.where(apart, gap, 1), equal)

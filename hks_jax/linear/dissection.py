@@ -18,9 +18,9 @@ from hks_jax.linear.bisection import within_groups
 from hks_jax.linear.pattern import Pattern
 
 _TRAFFIC = 20e6
-"""The memory traffic in bytes during one launch: 4 µs at 4.8 TB/s."""
+"""The memory traffic in bytes that takes as long as a kernel launch: 4 µs at 4.8 TB/s."""
 _LAUNCHES = 4
-"""The number of launches per level in a solve: a gather and a product, both upwards and downwards."""
+"""The number of kernel launches per level in a solve: a gather and a product, both upwards and downwards."""
 _BYTES = 8
 """The size of a number."""
 _ALIGNED = 64
@@ -30,7 +30,7 @@ Ints = Int[np.ndarray, " _"]
 
 
 class Level(NamedTuple):
-    """The fronts of one level: each eliminates its own s nodes, and is coupled to r boundary nodes eliminated later.
+    """The fronts of one level. A front eliminates s own nodes, and is coupled to r boundary nodes eliminated later.
 
     In smaller fronts, indices are padded with the first number that is out of range.
     """
@@ -71,8 +71,8 @@ class Dissection(NamedTuple):
     # the indices of the needed matrix entries in the array of entries; None means all entries in order
     entries: Int[np.ndarray, " m"] | None
     # the places of these entries in the concatenated blocks (fronts, s + r, s) of all levels. Of two entries equal by
-    # symmetry only one is needed, whose row is not eliminated before its column. If all entries are listed, unneeded
-    # ones have places out of range
+    # symmetry, only the one whose row is not eliminated before its column is needed. If all entries are listed, the
+    # others have places out of range
     places: Int[np.ndarray, " m"]
     padding: Int[np.ndarray, " p"]  # the places of the diagonal entries of padding nodes
     merged: Merged | None  # the merged tree for solves on accelerators; None if solves use the tree itself
@@ -93,7 +93,7 @@ def _dissect(pattern: Pattern, merge: bool) -> Dissection:
     n = pattern.size
     level, front, depth = pattern.bisect()
     own, slot = _own_nodes(level, front, depth)
-    # Positive if an entry's row is eliminated before its column, zero if with it, negative if after it.
+    # Positive if an entry's row is eliminated before its column, zero if on the same level, negative if after it.
     order_of_ends = level[rows] - level[cols]
     above = np.flatnonzero(order_of_ends > 0)
     boundaries = _boundaries(level, front, depth, rows[above], cols[above])
@@ -152,7 +152,7 @@ def _dissect(pattern: Pattern, merge: bool) -> Dissection:
 
 
 def _listed(entries: Ints, places: Ints, number: int, end: int) -> tuple[Ints | None, Ints]:
-    """Return needed entries and their places, or the places of all entries if this takes less memory."""
+    """Return the needed entries and their places; or None and the places of all entries, if this takes less memory."""
     others = number - entries.size
     if others > entries.size or end + others > np.iinfo(np.int32).max:
         return entries.astype(np.int32), places.astype(np.int32)
@@ -176,7 +176,7 @@ def _own_nodes(level: Ints, front: Ints, depth: int) -> tuple[list[np.ndarray], 
 
 
 def _boundaries(level: Ints, front: Ints, depth: int, rows: Ints, cols: Ints) -> list[Ints]:
-    """Return each level's boundary nodes as sorted keys front·n + node.
+    """Return the boundary nodes of each level's fronts as sorted keys front·n + node.
 
     A front's boundary nodes are eliminated later. Such a node is coupled to the front's own nodes by an entry (row,
     column), or inherited from the boundary of a child.
@@ -186,16 +186,16 @@ def _boundaries(level: Ints, front: Ints, depth: int, rows: Ints, cols: Ints) ->
     for number in reversed(range(depth)):
         inherited = keys // n // 2 * n + keys % n
         keys = np.sort(np.concatenate([inherited[level[keys % n] < number], keys_of[eliminated == number]]))
-        keys = keys[np.append(True, keys[1:] > keys[:-1])[: keys.size]]  # np.unique hashes, which takes far longer
+        keys = keys[np.append(True, keys[1:] > keys[:-1])[: keys.size]]  # far faster than np.unique, which hashes
         boundaries.append(keys)
     return boundaries[::-1]
 
 
 # On accelerators, solves use a merged tree: a front and its descendants on following levels become one front with an
 # explicit inverse. Merging increases memory traffic but reduces kernel launches; the groups of levels are chosen for
-# the least total cost. The factorisation, and hence the inertia, proceeds level by level. The method is that of F. L.
-# Alvarado, A. Pothen and R. Schreiber, Highly parallel sparse triangular solution, in Graph Theory and Sparse Matrix
-# Computation (Springer 1993).
+# the least total cost. The factorisation, which also gives the inertia, still uses the elimination tree. The method is
+# that of F. L. Alvarado, A. Pothen and R. Schreiber, Highly parallel sparse triangular solution, in Graph Theory and
+# Sparse Matrix Computation (Springer 1993).
 def merged(levels: tuple[Level, ...], n: int) -> Merged:
     """Merge levels of the elimination tree of n degrees of freedom."""
     groups = divided(levels, n)
@@ -224,7 +224,7 @@ def merged(levels: tuple[Level, ...], n: int) -> Merged:
 
 
 def divided(levels: tuple[Level, ...], n: int) -> list[tuple[int, int]]:
-    """Return the first level and the end of each group of levels, for the least cost of solves."""
+    """Divide the levels into groups for the least cost of solves; return the first level and the end of each group."""
     depth = len(levels)
     counts = [np.sum(level.own < n, axis=1) for level in levels]
     best: list[tuple[float, int]] = [(0.0, depth)] * (depth + 1)

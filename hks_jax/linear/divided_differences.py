@@ -13,8 +13,8 @@ Function = Callable[[Array], Array]
 def divided_difference(f: Function, low: Float[Array, "*n"], high: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Return f[a, b] = (f(b) − f(a))/(b − a) for a ≤ b, and f'(a) where they are equal.
 
-    This is also the mean of f' over the interval. The difference quotient is inaccurate where a and b are close, and
-    Gauss quadrature of the mean where they are far apart. `_mean_or_quotient` chooses between them.
+    This is also the mean of f' over the interval. The difference quotient is inaccurate for close a and b; Gauss
+    quadrature of the mean is inaccurate for distant a and b. `_mean_or_quotient` chooses between them.
     """
     gap = high - low
     slope = _derivative(f)
@@ -28,7 +28,8 @@ def divided_difference(f: Function, low: Float[Array, "*n"], high: Float[Array, 
 #
 #     f[a, b, c] = ∫₀¹ s ∫₀¹ f''(a + s (b − a) + s u (c − b)) du ds,
 #
-# by Gauss quadrature in both variables. The equal quotient (f[b, c] − f[a, b])/(c − a) is inaccurate for close a, b, c.
+# computed by Gauss quadrature in both variables. The equivalent quotient (f[b, c] − f[a, b])/(c − a) is inaccurate for
+# close a, b, c.
 def second_divided_difference(
     f: Function,
     low: Float[Array, "*n"],
@@ -40,8 +41,8 @@ def second_divided_difference(
 ) -> Float[Array, "*n"]:
     """Return f[a, b, c] for a ≤ b ≤ c, and f''(a)/2 where they are equal, given f[a, b] and f[b, c].
 
-    The scale is the largest magnitude of f' or [f]. The error of the result is about the rounding error of the scale,
-    also where f' is much smaller, as for f' = 1 − tanh².
+    The scale is the largest magnitude of all first divided differences. The error of the result is about the rounding
+    error of the scale, also where f' is much smaller, as for f' = 1 − tanh².
     """
     curvature = _derivative(_derivative(f))
 

@@ -18,7 +18,7 @@ from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.multifrontal import Factorisation, Trial, eliminate, factorise, try_out
 from hks_jax.linear.operators import DiagonalOperator, OfColumns, PatternedOperator
 from hks_jax.linear.pencil import SymmetricPencil, tabulated
-from hks_jax.linear.selected_inversion import Eliminated, eliminated_differentiably, selected
+from hks_jax.linear.selected_inversion import Eliminated, inverse_entries, selected
 from hks_jax.linear.symmetric_inverse import symmetric_inverses
 from hks_jax.traced import is_traced
 
@@ -75,7 +75,7 @@ class FactorisedMatrix(eqx.Module):
 
     @property
     def inertia(self) -> Inertia:
-        """The numbers of negative and positive eigenvalues of A; for A = K − σM, of the pencil's below and above σ."""
+        """Counts of A's negative and positive eigenvalues; for K − σM, of the pencil's eigenvalues λ < σ and λ > σ."""
         negative = self.factor.negative
         counts = negative, jnp.asarray(self.size, negative.dtype) - negative
         return Inertia(*(jnp.where(self.sound, count, -1) for count in counts))
@@ -123,8 +123,8 @@ class FactorisedMatrix(eqx.Module):
         if not is_traced(self.error) and self.sound:
             if jnp.isinf(self.error):
                 raise ValueError(
-                    "matrix: got a regular A, but the elimination begins at a block of A that is singular or nearly "
-                    "so. Solutions are accurate, but the determinant and the inverse are not. Shift A slightly"
+                    "matrix: got a nonsingular A, but the elimination begins at a block of A that is singular or "
+                    "nearly so. Solutions are accurate, but the determinant and the inverse are not. Shift A slightly"
                 )
             if self.error > _DOUBTFUL:
                 warn_of_accuracy(
@@ -135,7 +135,7 @@ class FactorisedMatrix(eqx.Module):
 
 
 def _nan_unless(known: Bool[Array, ""], x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Return x, or NaN. The product also makes derivatives NaN, where `jnp.where` would make them zero."""
+    """Return x if known, otherwise NaN. The product also makes derivatives NaN; `jnp.where` would make them zero."""
     return x * jnp.where(known, 1.0, jnp.nan).astype(x.dtype)
 
 
@@ -143,7 +143,7 @@ def factorised(matrix: PatternedOperator, name: str = "matrix") -> FactorisedMat
     """Factorise a symmetric matrix A. Only one of each pair of entries equal by symmetry is read.
 
     Raises:
-        ValueError: A is concrete, and not finite or singular. The message begins with the given name.
+        ValueError: A is concrete, and singular or not finite. The message begins with ``name``.
     """
     ones = jnp.ones(matrix.size, matrix.dtype)
     pencil = tabulated(SymmetricPencil(matrix, DiagonalOperator(ones)))
@@ -160,7 +160,7 @@ def factorised(matrix: PatternedOperator, name: str = "matrix") -> FactorisedMat
 def certain_factorisation(
     dissection: Dissection, pencil: SymmetricPencil, shift: Scalar
 ) -> tuple[Factorisation, Trial, Int[Array, ""]]:
-    """Factorise K − σM, if necessary again with small pivots replaced; also return the `Trial`, and the tries."""
+    """Factorise K − σM, if necessary again with small pivots replaced; return factors, `Trial` and number of tries."""
     probes = jax.random.normal(jax.random.key(0), (pencil.size, _PROBES), shift.dtype)
     bounded, matrix = float(jnp.finfo(shift.dtype).eps) ** _LEAST_PIVOT, pencil.shifted(shift)
 
@@ -248,7 +248,7 @@ def _refined(factor: Factorisation, norm: Scalar, product: OfColumns, b: Columns
 
 
 def _eliminated(matrix: Float[Array, " m"], factor: Factorisation) -> Eliminated:
-    """Return (A⁻¹, BA⁻¹) of the elimination tree; if solves use a merged tree, eliminate the matrix again."""
+    """Return (A⁻¹, BA⁻¹) for the elimination tree; if solves use a merged tree, eliminate the matrix again."""
     tree = factor.dissection
     if tree.merged is not None:
         return eliminate(tree, matrix, lambda blocks, _: symmetric_inverses(blocks)[0])
@@ -256,8 +256,8 @@ def _eliminated(matrix: Float[Array, " m"], factor: Factorisation) -> Eliminated
     return [(both[:, :s], both[:, s:]) for s, both in zip(sizes, factor.downward, strict=True)]
 
 
-# d(A⁻¹) = −A⁻¹ dA A⁻¹ is needed at some places. The rule differentiates the elimination and the recurrence from the
-# first separator to the cells. The transpose takes a few times as many operations. Values use the factors.
+# Only some entries of d(A⁻¹) = −A⁻¹ dA A⁻¹ are needed. The rule differentiates the elimination and the recurrence from
+# the first separator to the cells; its transpose takes a few times as many operations. Values use the factors.
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _inverse(diagonal: bool, matrix: Float[Array, " m"], factor: Factorisation) -> Float[Array, " n"]:
     return selected(factor.dissection, _eliminated(matrix, factor), diagonal)
@@ -266,11 +266,8 @@ def _inverse(diagonal: bool, matrix: Float[Array, " m"], factor: Factorisation) 
 @_inverse.defjvp
 def _inverse_jvp(diagonal: bool, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     matrix, factor = primals
-
-    def of_matrix(matrix: Array) -> Array:
-        return selected(factor.dissection, eliminated_differentiably(factor.dissection, matrix), diagonal)
-
-    return _inverse(diagonal, matrix, factor), jax.jvp(of_matrix, (matrix,), tangents[:1])[1]
+    tangent = jax.jvp(lambda matrix: inverse_entries(factor.dissection, matrix, diagonal), (matrix,), tangents[:1])[1]
+    return _inverse(diagonal, matrix, factor), tangent
 
 
 @jax.custom_jvp
@@ -279,7 +276,7 @@ def _log_of_pivots(matrix: Float[Array, " m"], factor: Factorisation) -> Scalar:
 
 
 # d log|det A| = tr(A⁻¹ dA) = Σ (A⁻¹)ᵢⱼ dAᵢⱼ needs the inverse where A has entries. All entries of a front's own block
-# are listed. Of the coupling to its boundary and the transpose only one is listed, which counts twice.
+# are listed. Of the coupling to its boundary and the transposed coupling, only one is listed, and counts twice.
 @_log_of_pivots.defjvp
 def _log_of_pivots_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     (matrix, factor), (change, _) = primals, tangents

@@ -8,7 +8,7 @@ threads.
 """
 
 from collections.abc import Callable
-from functools import wraps
+from functools import partial, wraps
 from typing import ParamSpec, TypeVar
 
 import jax
@@ -22,11 +22,7 @@ T = TypeVar("T")
 
 
 def _matrix_by_matrix(function: Callable[P, T]) -> Callable[P, T]:
-    @wraps(function)
-    def call(*args: P.args, **kwargs: P.kwargs) -> T:
-        return one_by_one(function, (), *args)
-
-    return call
+    return wraps(function)(partial(one_by_one, function, ()))
 
 
 @_matrix_by_matrix

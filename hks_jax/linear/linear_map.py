@@ -1,6 +1,6 @@
 """Building blocks of derivative rules: linear maps with custom rules, which allow second derivatives in any order.
 
-Guards raise an error where differentiating a rule again would give wrong numbers.
+`not_differentiable` and `first_order_only` raise an error if differentiating a rule again would give wrong numbers.
 """
 
 from collections.abc import Callable
@@ -40,8 +40,8 @@ def linear_map(function: LinearMap, derivative: Derivative, at: Any, constants: 
 def with_transpose(forward: Callable[[Any], Any], backward: Callable[[Any], Any], x: Any, at: Any = ()) -> Any:
     """Return y = ``forward(x)``, linear in x, whose transpose is ``backward``; JAX itself transposes neither.
 
-    Both x and y are pytrees of floating point arrays. ``at`` contains further variables of the two functions, whose
-    derivatives have custom rules.
+    Both x and y are pytrees of floating point arrays. ``at`` contains the other variables of the two functions;
+    derivatives with respect to these have custom rules.
     """
 
     # JAX transposes a solve only if its whole right-hand side depends on the linearised variables, x or `at`.

@@ -35,7 +35,7 @@ def for_each(count: int, step: Callable[[Any, State], State], state: State) -> S
 
 
 def by_column_ranges(function: Callable[[jax.Array], jax.Array], width: int, x: jax.Array) -> jax.Array:
-    """Replace ranges of columns of x, each at most ``width`` wide, by their images, in place in a compiled function."""
+    """Replace ranges of at most ``width`` columns of x by their images under a function, in place under `jax.jit`."""
 
     def replace(start: Any, size: int, x: jax.Array) -> jax.Array:
         image = function(jax.lax.dynamic_slice_in_dim(x, start, size, axis=1))
@@ -48,7 +48,7 @@ def by_column_ranges(function: Callable[[jax.Array], jax.Array], width: int, x: 
 
 
 def when(condition: Any, function: Callable[[State], State], state: State) -> State:
-    """Return ``function(state)`` if the condition holds, otherwise the state; by `jax.lax.cond` if it is traced."""
+    """Return ``function(state)`` if the condition holds, otherwise the state; if traced, by `jax.lax.cond`."""
     if is_traced(condition):
         return jax.lax.cond(condition, function, lambda state: state, state)
     return function(state) if condition else state
@@ -64,7 +64,7 @@ def one_by_one(function: Callable[..., Any], settings: tuple[Hashable, ...], *ar
     object in every call, so that it is compiled once. Settings are static.
     """
     if not is_traced(args):
-        # Otherwise, JAX would compile the primal part of a derivative again outside `jit`.
+        # Without this context, JAX would compile the primal part of a derivative again outside `jit`.
         with contextlib.nullcontext() if is_staged() else jax.core.eval_context():
             return function(*settings, *args)
     # `custom_vmap` supports no static arguments, so that each call defines a rule; its body is compiled only once.

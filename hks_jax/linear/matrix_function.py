@@ -17,7 +17,8 @@ from hks_jax.linear.products import matmul
 
 Matrix = Float[Array, "n n"]
 Function = Callable[[Any, Any, Array], Array]
-"""f(parameters, others, x), elementwise in x. ``parameters`` is a pytree of real arrays, ``others`` of other arrays."""
+"""f(parameters, others, x), elementwise in x. ``parameters`` is a pytree of real arrays, and ``others`` of the other
+arrays."""
 
 
 def matrix_function(A: Any, f: Callable[[Array], Any], B: Any = None) -> Float[Array, "n n"]:
@@ -30,8 +31,8 @@ def matrix_function(A: Any, f: Callable[[Array], Any], B: Any = None) -> Float[A
     any order. These derivatives are exact at equal eigenvalues, and accurate at nearly equal ones, because no division
     by a small gap occurs. `jax.vmap` over parameters of f computes eigenpairs once. Third derivatives raise an error.
 
-    The function takes O(n³) time, mainly for the eigenpairs, and O(n²) memory; a gradient takes about as much again.
-    Second derivatives evaluate f'' 89 times for each of n³ triples of eigenvalues, and so are for small matrices.
+    The function takes O(n³) time, mainly for the eigenpairs, and O(n²) memory; a gradient doubles the time. Second
+    derivatives evaluate f'' 89 times for each of n³ triples of eigenvalues, and so suit only small matrices.
 
     Args:
         A: (n, n), symmetric, float32 or float64. Derivatives are with respect to the symmetric part of A.
@@ -41,7 +42,7 @@ def matrix_function(A: Any, f: Callable[[Array], Any], B: Any = None) -> Float[A
         B: (n, n), symmetric positive definite; None: the identity.
 
     Returns:
-        The symmetric matrix f(A), (n, n). The matrix is NaN if f is NaN, as for the logarithm of a negative eigenvalue.
+        The symmetric matrix f(A), (n, n). It is NaN if f returns NaN, as for the logarithm of a negative eigenvalue.
 
     Raises:
         ValueError: f does not return a real scalar; `eigh` refuses A or B.
@@ -144,7 +145,7 @@ def _table(f: Callable[[Array], Array], values: Float[Array, " n"]) -> Matrix:
 
 
 def _table_along(f: Function, parameters: Any, others: Any, values: Float[Array, " n"], change: Any) -> Matrix:
-    """Return [∂f], linear in the change, because the choice between a mean and a quotient depends only on f."""
+    """Return [∂f]. It is linear in the change, because whether `_table` uses a mean or a quotient depends only on f."""
     return jax.jvp(lambda p: _table(partial(f, p, others), values), (parameters,), (change,))[1]
 
 
@@ -153,7 +154,7 @@ def _mixed(f: Callable[[Array], Array], values: Float[Array, " n"], table: Matri
     n, scale = len(values), jnp.max(jnp.abs(table))
     i, k = jnp.arange(n)[:, None], jnp.arange(n)
 
-    @jax.checkpoint  # reverse mode would keep n³ numbers
+    @jax.checkpoint  # reverse mode would otherwise store n³ numbers
     def add(total: Matrix, j: Array) -> tuple[Matrix, None]:
         low, high = jnp.minimum(jnp.minimum(i, k), j), jnp.maximum(jnp.maximum(i, k), j)
         middle = i + j + k - low - high

@@ -20,7 +20,7 @@ from hks_jax.compilation import jit_quickly
 from hks_jax.linear import lapack
 from hks_jax.linear.dissection import Dissection, Level, Merged
 from hks_jax.linear.pencil import SymmetricPencil
-from hks_jax.linear.products import batched_with_columns, gram, matmul, transposed
+from hks_jax.linear.products import batched_with_columns, gram, matmul
 from hks_jax.linear.symmetric_inverse import symmetric_inverses
 
 CONTRACTION = 0.1
@@ -34,25 +34,25 @@ Blocks = tuple[Array, ...]
 class Factorisation(eqx.Module):
     """K − σM = LDLᵀ.
 
-    Eliminating a front with own block A and coupling B to its boundary leaves the Schur complement C − BA⁻¹Bᵀ on the
-    boundary. A stack of factorisations, for several σ, has an additional leading axis.
+    A front has an own block A, a coupling B to its boundary, and a block C at the boundary. Its elimination leaves the
+    Schur complement C − BA⁻¹Bᵀ. A stack of factorisations, for several σ, has an additional leading axis.
     """
 
     dissection: Dissection  # the elimination tree
     # A⁻¹ stacked on BA⁻¹, (fronts, s + r, s), for each level of the (merged) tree
     downward: tuple[Float[Array, "... _fronts _s_plus_r _s"], ...]
     upward: tuple[Float[Array, "... _fronts _s _r"], ...]  # (BA⁻¹)ᵀ, (fronts, s, r)
-    # pivots: their product is the determinant, and as many are negative as eigenvalues of K − σM; padding has pivots 1
+    # pivots: their product is the determinant, and their signs give the inertia of K − σM; padding has pivots 1
     pivots: Float[Array, "... pivots"]
 
     @property
     def arrays(self) -> tuple[Blocks, Blocks, Array]:
-        """All arrays but the dissection, because XLA would copy the dissection if compiled functions returned it."""
+        """All arrays except the dissection, which XLA would copy if compiled functions returned it."""
         return self.downward, self.upward, self.pivots
 
     @property
     def negative(self) -> Int[Array, "..."]:
-        """The number of negative eigenvalues; by Sylvester's law of inertia, the number of the pencil's below σ."""
+        """The number of negative eigenvalues, which equals the number of the pencil's eigenvalues below σ."""
         return jnp.sum(self.pivots < 0, axis=-1)
 
     @jax.jit
@@ -88,10 +88,10 @@ def factorise(dissection: Dissection, matrix: Float[Array, " m"], least: Scalar 
     return Factorisation(dissection, *_eliminate(dissection, matrix, least))
 
 
-# Let the computed LDLᵀ be F = A + E, where A = K − σM. If the spectral radius of EF⁻¹ is below one, the matrix
-# F − tE = (1 − tEF⁻¹)F is regular for all t in [0, 1]. So no eigenvalue crosses zero, and F and A have equal inertia.
-# For x = F⁻¹b, the residual b − Ax equals EF⁻¹b, so that repeated solves with residuals are a power iteration. If the
-# first residual is tiny, one step suffices, as a random b has a component of order 1/√n along every direction.
+# Let the computed LDLᵀ be F = A + E, where A = K − σM. If the spectral radius of EF⁻¹ is below one, then F − tE = (1 −
+# tEF⁻¹)F is nonsingular for all t in [0, 1]. So no eigenvalue crosses zero, and F and A have equal inertia. For x =
+# F⁻¹b, the residual b − Ax equals EF⁻¹b, so that repeated solves with residuals are a power iteration. If the first
+# residual is tiny, one step suffices, as a random b has a component of order 1/√n along every direction.
 @jit_quickly()
 def try_out(factor: Factorisation, pencil: SymmetricPencil, shift: Scalar, b: Float[Array, "n_dof b"]) -> Trial:
     """Measure the accuracy of a factorisation with random right-hand sides b."""
@@ -141,14 +141,14 @@ def _eliminate(
 
     levels = eliminate(dissection, matrix, inverted)
     downward = tuple(jnp.concatenate(level, axis=1) for level in levels)
-    upward = tuple(transposed(coupling) for _, coupling in levels)
+    upward = tuple(coupling.mT for _, coupling in levels)
     if dissection.merged is not None:
         downward, upward = _merged(dissection.levels, dissection.merged, downward, upward)
     return downward, upward, jnp.concatenate(pivots)
 
 
 def _merged(levels: tuple[Level, ...], merged: Merged, downward: Blocks, upward: Blocks) -> tuple[Blocks, Blocks]:
-    """Return the matrices of merged levels, by substitution with the identity along the levels in each of them."""
+    """Return the matrices of merged levels, by substitution along the levels of each group, applied to the identity."""
     inverses, couplings, first = [], [], 0
     for rows, places in zip(merged.rows, merged.places, strict=True):
         (fronts, s), group = places.shape, slice(first, first + len(rows))
@@ -162,7 +162,7 @@ def _merged(levels: tuple[Level, ...], merged: Merged, downward: Blocks, upward:
         x, passed = _substituted(within, downward[group], upward[group], identity)
         inverse = x.at[places].get(mode="fill", fill_value=0, wrap_negative_indices=False)
         inverses.append(jnp.concatenate([inverse, -passed], axis=1))
-        couplings.append(-transposed(passed))
+        couplings.append(-passed.mT)
     return tuple(inverses), tuple(couplings)
 
 
@@ -192,7 +192,7 @@ def eliminate(
             blocks, beyond = blocks + added[:, :, :s], added[:, s:, s:]
         inverse = invert(blocks[:, :s], sizes)
         coupling = matmul(blocks[:, s:], inverse)
-        schur = beyond - matmul(coupling, transposed(blocks[:, s:]))
+        schur = beyond - matmul(coupling, blocks[:, s:].mT)
         eliminated.append((inverse, coupling))
     return eliminated[::-1]
 
@@ -200,7 +200,7 @@ def eliminate(
 def _substituted(
     levels: tuple[Level, ...], downward: Blocks, upward: Blocks, rhs: Float[Array, "n b"]
 ) -> tuple[Float[Array, "m b"], Float[Array, "fronts r b"]]:
-    """Solve along levels with x = 0 at the first one's boundary; return x at own nodes, and the boundary residual."""
+    """Solve along levels, with x = 0 at the boundary of the first; return x at own nodes, and the boundary residual."""
     width = rhs.shape[1]
     own: list[Array] = []
     passed: Array | None = None

@@ -22,7 +22,7 @@ OfColumns = Callable[[Float[Array, "n_dof b"]], Float[Array, "n_dof b"]]
 _PLACES = 1 << 12
 """The number of entries of an outer product that are computed together: their operands fit into the cache."""
 _RUN = 8
-"""The mean number of consecutive entries that share a distance to the diagonal, above which slices beat indices."""
+"""Slices are faster than indices if runs of entries at one distance to the diagonal are longer than this on average."""
 ROUNDING = 1000
 """The largest accepted asymmetry of a matrix, in units of ε times its largest entry."""
 
@@ -41,7 +41,7 @@ class Operator(eqx.Module):
 
     @abstractmethod
     def of_columns(self) -> OfColumns:
-        """Return the product with a block of columns, as a function; call this outside a loop of products."""
+        """Return the function that multiplies a block of columns; for products in a loop, call this before the loop."""
 
     @abstractmethod
     def triplets(self) -> tuple[Float[Array, " nnz"], Places]:
@@ -147,7 +147,7 @@ class SparseOperator(PatternedOperator):
     Attributes:
         entries: the entries (m,) in the order of the pattern.
         structure: the pattern; static.
-        table: the pattern's table as arrays, which are arguments of compiled functions. With None, the table is a
+        table: the pattern's table as arrays, which are arguments of compiled functions. If it is None, the table is a
             constant, which for a million rows adds seconds to each compilation.
     """
 
@@ -249,9 +249,9 @@ def shifted(stiffness: PatternedOperator, mass: Operator, shift: Inexact[Array, 
 def require_symmetric(
     name: str, values: Any, places: Places, size: int, remedy: str, limit: float | None = None
 ) -> None:
-    """Raise ValueError unless a matrix is finite and symmetric. Repeated places add up.
+    """Raise ValueError unless a matrix is finite and symmetric. Entries at equal places are added.
 
-    The limit of asymmetry is relative to the largest entry; None is the level of rounding.
+    The limit of asymmetry is relative to the largest entry; None means the level of rounding.
     """
     data, (rows, cols) = np.asarray(values), places
     wrong = int((~np.isfinite(data)).sum())

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Int
 
-from hks_jax.arrays import StaticArray
+from hks_jax.arrays import ByKey, StaticArray
 from hks_jax.linear.bisection import Parts, bisect_graph
 
 
@@ -32,7 +32,7 @@ class Pattern:
 
 
 class Ellpack(NamedTuple):
-    """A pattern in ELLPACK format: a table with one row of slots per matrix row, and a list of overflowing entries."""
+    """A pattern in ELLPACK format: a table with a few slots for each matrix row, and a list of further entries."""
 
     entries: Int[np.ndarray | Array, "width n"]  # indices of the entries in the table; out of range for empty slots
     cols: Int[np.ndarray | Array, "width n"]  # the columns of these entries
@@ -47,22 +47,16 @@ _SCATTERED = 3
 
 
 @jax.tree_util.register_static
-class SparsePattern(Pattern):
+class SparsePattern(ByKey, Pattern):
     """A symmetric pattern with a full diagonal. Entries are sorted by row, then by column."""
 
+    rows: Int[np.ndarray, " m"]  # the row of each entry
+    cols: Int[np.ndarray, " m"]  # the column of each entry
+
     def __init__(self, size: int, rows: Int[np.ndarray, " m"], cols: Int[np.ndarray, " m"]) -> None:
-        self.size, self.n_entries = size, len(rows)
-        self._rows, self._cols = StaticArray(rows, np.int32), StaticArray(cols, np.int32)
-
-    @property
-    def rows(self) -> Int[np.ndarray, " m"]:
-        """The row of each entry."""
-        return self._rows.value
-
-    @property
-    def cols(self) -> Int[np.ndarray, " m"]:
-        """The column of each entry."""
-        return self._cols.value
+        places = StaticArray(rows, np.int32), StaticArray(cols, np.int32)
+        self.size, self.n_entries, self._key = size, len(rows), (size, *places)
+        self.rows, self.cols = (each.value for each in places)
 
     def places(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return for each place its index into the array of entries, its row, and its column."""
@@ -83,7 +77,8 @@ class SparsePattern(Pattern):
 
     @cached_property
     def table(self) -> Ellpack:
-        """The pattern as a table. The width minimises the cost of products: a few long rows do not increase it."""
+        """The pattern as a table. Its width minimises the cost of products: a few long rows do not increase the
+        width."""
         counts = np.bincount(self.rows, minlength=self.size)
         start = np.cumsum(counts) - counts
         longer = np.cumsum(np.bincount(counts)[::-1])[::-1][1:]  # the number of rows with more than 0, 1, … entries
@@ -97,12 +92,3 @@ class SparsePattern(Pattern):
         others = np.flatnonzero(np.arange(self.rows.size) - start[self.rows] >= width)
         fields = entries, cols, others, self.rows[others], self.cols[others], self.diagonal()
         return Ellpack(*(field.astype(np.int32) for field in fields))
-
-    def __eq__(self, other: object) -> bool:
-        return self is other or (
-            isinstance(other, SparsePattern)
-            and (self.size, self._rows, self._cols) == (other.size, other._rows, other._cols)
-        )
-
-    def __hash__(self) -> int:
-        return hash((self.size, self._rows, self._cols))

@@ -56,11 +56,6 @@ class SymmetricPencil(eqx.Module):
         """The number of null vectors that every perturbation of K annihilates."""
         return self.n_null if self.null_space is not None and self.null_space.fixed else 0
 
-    @property
-    def parts(self) -> tuple["SymmetricPencil", ...]:
-        """A tuple of the pencil itself, for symmetry with pencils of several parts."""
-        return (self,)
-
     def shifted(self, shift: Float[Array, ""]) -> Float[Array, " m"]:
         """Return the entries of K − σM at the places of K's pattern."""
         return shifted(self.stiffness, self.mass, shift)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Inexact, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.linear import accelerators
 from hks_jax.linear.linear_map import with_transpose
@@ -61,11 +61,6 @@ def _written_out(matrices: Float[Array, "m i j"], columns: Float[Array, "m j b"]
     return reduce(add, (matrices[:, :, j : j + 1] * columns[:, j : j + 1] for j in range(matrices.shape[2])))
 
 
-def transposed(x: Inexact[Array, "m i j"]) -> Inexact[Array, "m j i"]:
-    """Return the transposes of a batch of matrices."""
-    return jnp.swapaxes(x, 1, 2)
-
-
 # The derivative with respect to parameters of the function sums over the rows. Written out row by row, the sum is
 # fused; a reduction would be many times slower on CPUs. The derivative recomputes intermediate results, because storing
 # them would take several arrays of the size of all rows.
@@ -107,12 +102,12 @@ def row_blocks(
 
 
 def aligned(x: Array, like: ArrayLike) -> Array:
-    """Return x with leading axes up to the rank of ``like``, because `jax_numpy_rank_promotion` may be an error."""
+    """Return x with leading axes of length 1 up to the rank of ``like``, because a user may forbid rank promotion."""
     return jnp.expand_dims(x, tuple(range(jnp.ndim(like) - x.ndim)))
 
 
 _OF_MATRIX, _BLOCKS = 64, 8
-"""The least number of rows in a block of C, and the maximal number of blocks; each is compiled separately."""
+"""The least number of rows in a block of a matrix, and the maximal number of blocks; each is compiled separately."""
 _POINTS = 2048
 """The number of points per step, at which a few hundred vectors fit into the cache."""
 
@@ -123,9 +118,9 @@ _POINTS = 2048
 def quadratic_forms(
     matrices: Float[Array, "m k k"], vectors: Float[Array, "k n"], matters: Bool[Array, "m k"]
 ) -> Float[Array, "m n"]:
-    """Return Σᵢⱼ Cᵢⱼ φᵢ(x) φⱼ(x) for each C; not differentiable with respect to φ.
+    """Return Σᵢⱼ Cᵢⱼ φᵢ(x) φⱼ(x) for each matrix C; not differentiable with respect to φ.
 
-    Entries of C between functions that do not matter for this C may be treated as zero.
+    Entries of C for pairs of functions that do not matter for this C may be treated as zero.
     """
     (m, k), n = matters.shape, vectors.shape[1]
     size, width = min(max(_OF_MATRIX, -(-k // _BLOCKS)), k), min(_POINTS, n)
@@ -170,7 +165,7 @@ def quadratic_forms(
             return results
 
         none = [jnp.zeros((m, k - i, min(size, k - i)), vectors.dtype) for i in first]
-        return [transposed(block) for block in jax.lax.fori_loop(0, len(starts), add_points, none)]
+        return [block.mT for block in jax.lax.fori_loop(0, len(starts), add_points, none)]
 
     square = np.arange(k) // size == np.arange(k)[:, None] // size
     triangle = jnp.where(square, matrices, 2 * matrices)

@@ -5,13 +5,11 @@ elimination, the coupling B to its boundary, and C = BA⁻¹. Then the inverse G
 
     G_own = A⁻¹ + Cᵀ G_b C,    G_b,own = −G_b C,
 
-where G_b is its block at the boundary. A front's boundary nodes are own or boundary nodes of the front above. So the
-recursion goes from the first separator down to the cells, and each level needs only blocks of the level above. The
+where G_b is the block of G at the boundary. A front's boundary nodes are own or boundary nodes of the front above. So
+the recursion goes from the first separator down to the cells, and each level needs only blocks of the level above. The
 recursion takes about as many operations as the factorisation, O(N^1.5) in 2D and O(N²) in 3D: L. Lin and others,
 SelInv, ACM Trans. Math. Softw. 37 (2011).
 """
-
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,32 +18,22 @@ from jaxtyping import Array, Inexact
 from hks_jax.linear import lapack
 from hks_jax.linear.dissection import Dissection
 from hks_jax.linear.multifrontal import eliminate, gather_symmetric, taken
-from hks_jax.linear.products import matmul, transposed
+from hks_jax.linear.products import matmul
 
 Eliminated = list[tuple[Inexact[Array, "_fronts _s _s"], Inexact[Array, "_fronts _r _s"]]]
 """The matrices (A⁻¹, BA⁻¹) of the fronts of each level."""
 
 
-class Cost(NamedTuple):
-    """The cost of the selected inversion of one matrix."""
-
-    operations: float  # the number of floating-point operations in complex arithmetic
-    entries: float  # the number of stored entries: the factors, and the inverse on two levels
-
-
-def diagonal_of_inverse(dissection: Dissection, matrix: Inexact[Array, " m"]) -> Inexact[Array, " n_dof"]:
-    """Return the diagonal of the inverse of a symmetric matrix, real or complex (not Hermitian).
+def inverse_entries(
+    dissection: Dissection, matrix: Inexact[Array, " m"], diagonal: bool = True
+) -> Inexact[Array, " entries"]:
+    """Return the entries of `selected` for the inverse of a symmetric matrix, real or complex (not Hermitian).
 
     The elimination does not pivot between fronts. This is safe if the real or imaginary part of the matrix is definite,
-    because then all Schur complements are regular. The function is differentiable in both modes; reverse mode stores
+    because then no Schur complement is singular. The function is differentiable in both modes; reverse mode stores
     several copies of the factors.
     """
-    return selected(dissection, eliminated_differentiably(dissection, matrix), diagonal=True)
-
-
-def eliminated_differentiably(dissection: Dissection, matrix: Inexact[Array, " m"]) -> Eliminated:
-    """Call `eliminate` with an inverse whose derivative rule can be differentiated any number of times."""
-    return eliminate(dissection, matrix, lambda blocks, _: _inverses(blocks))
+    return selected(dissection, eliminate(dissection, matrix, lambda blocks, _: _inverses(blocks)), diagonal)
 
 
 def selected(dissection: Dissection, eliminated: Eliminated, diagonal: bool) -> Inexact[Array, " m"]:
@@ -61,17 +49,17 @@ def selected(dissection: Dissection, eliminated: Eliminated, diagonal: bool) -> 
         if diagonal and last:  # cells need only their diagonal
             own = jnp.diagonal(inverse, axis1=1, axis2=2) - jnp.sum(coupling * beside, axis=1)
         else:
-            block = inverse - matmul(transposed(coupling), beside)
+            block = inverse - matmul(coupling.mT, beside)
             if not last:
-                known = jnp.block([[block, transposed(beside)], [beside, boundary]])
+                known = jnp.block([[block, beside.mT], [beside, boundary]])
             own = jnp.diagonal(block, axis1=1, axis2=2) if diagonal else jnp.concatenate([block, beside], axis=1)
         parts.append(own.reshape(-1))
     whole = jnp.concatenate(parts)
     return taken(whole, dissection.order) if diagonal else whole
 
 
-def inversion_cost(dissection: Dissection) -> Cost:
-    """Estimate the cost of `diagonal_of_inverse`."""
+def inversion_cost(dissection: Dissection) -> tuple[float, float]:
+    """Estimate the number of floating-point operations of a complex selected inversion, and of entries in memory."""
     operations = entries = most = 0.0
     for level in dissection.levels:
         fronts, whole, s = level.shape
@@ -79,7 +67,7 @@ def inversion_cost(dissection: Dissection) -> Cost:
         operations += 8.0 * fronts * s * (s * s + 2 * s * r + 2 * r * r)
         entries += fronts * whole * s
         most = max(most, fronts * whole * whole)
-    return Cost(operations, entries + 2 * most)
+    return operations, entries + 2 * most
 
 
 @jax.custom_jvp

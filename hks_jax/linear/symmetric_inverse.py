@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hks_jax.linear import accelerators, lapack
-from hks_jax.linear.products import even_size, matmul, transposed
+from hks_jax.linear.products import even_size, matmul
 
 Matrices = Float[Array, "m n n"]
 Pivots = Float[Array, " m"]
@@ -21,17 +21,17 @@ swept in about ``_BLOCKS`` blocks."""
 _ROWS = 32
 """The largest size of blocks that are swept row by row."""
 _MANY = 128
-"""The least number of fronts of a level at which usually all are definite, because the shift is below their spectra."""
+"""If a level has at least this number of fronts, usually all are definite, because the shift is below their spectra."""
 _LARGEST, _SMALLEST = 64, 16
 """The largest number of rows of a kernel's matrix (4 warps with 32 numbers per thread), and the least after padding."""
 
 
 def symmetric_inverses(matrices: Matrices, least: Pivots | None = None) -> Inverses:
-    """Return the inverses and the pivots of each matrix: det A is their product, and their signs give the inertia.
+    """Return the inverse of each matrix A, and pivots, whose product is det A and whose signs give the inertia.
 
     Pivots smaller than ``least`` are replaced by ±``least``. Without ``least``, the inverse of a singular matrix is not
     finite. On CPUs, LAPACK computes Cholesky factors of large batches, which are usually definite, and eigenvalues of
-    others. Accelerators use elimination, because eigenvalues and Cholesky factors are slow there.
+    small ones. Accelerators use elimination, because eigenvalues and Cholesky factors are slow there.
     """
     none = jnp.zeros(len(matrices), matrices.dtype) if least is None else least
     if not accelerators.at_hand():  # avoids tracing unused branches
@@ -53,18 +53,18 @@ def _kernel_agrees(dtype: Any) -> bool:
 
 
 def by_cholesky_factors(matrices: Matrices, least: Pivots) -> Inverses:
-    """Invert by Cholesky factors, in a third of the time; by eigenvalues if a matrix is indefinite or a pivot small."""
+    """Invert by Cholesky factors, or by eigenvalues, three times as slow, if a pivot is negative or small."""
     inverses = jax.vmap(lapack.inverse_cholesky)(matrices)
     pivots = jnp.diagonal(inverses, axis1=1, axis2=2) ** -2
     return jax.lax.cond(
         jnp.all(pivots > least[:, None]),  # pivots are NaN if a matrix is not definite
-        lambda: (matmul(transposed(inverses), inverses), pivots),
+        lambda: (matmul(inverses.mT, inverses), pivots),
         lambda: by_eigenvalues(matrices, least),
     )
 
 
 def by_eigenvalues(matrices: Matrices, least: Pivots) -> Inverses:
-    """Invert small matrices by their eigenvalues, and others by sweeping blocks that are inverted likewise.
+    """Invert small matrices by their eigenvalues, and others by sweeping blocks, which the same function inverts.
 
     Large blocks are in turn swept in small blocks, which needs few passes over the matrix. The largest matrices are
     divided into halves, which takes fewer operations.
@@ -73,7 +73,7 @@ def by_eigenvalues(matrices: Matrices, least: Pivots) -> Inverses:
     if n <= _BLOCK:
         values, vectors = jax.vmap(lapack.eigh)(matrices)
         values = _away_from_zero(values, least[:, None])
-        return matmul(vectors / values[:, None, :], transposed(vectors)), values
+        return matmul(vectors / values[:, None, :], vectors.mT), values
     if n <= _LARGE:
         size = even_size(n, max(_BLOCK, n // _BLOCKS))
         return _by_blocks(by_eigenvalues, size, matrices, least)
@@ -81,10 +81,10 @@ def by_eigenvalues(matrices: Matrices, least: Pivots) -> Inverses:
     first, values = by_eigenvalues(matrices[:, :half, :half], least)
     coupling = matmul(matrices[:, half:, :half], first)
     schur = matrices[:, half:, half:] - matmul(coupling, matrices[:, :half, half:])
-    last, others = by_eigenvalues((schur + transposed(schur)) / 2, least)
+    last, others = by_eigenvalues((schur + schur.mT) / 2, least)
     beside = -matmul(last, coupling)
-    first = first - matmul(transposed(coupling), beside)
-    whole = jnp.block([[first, transposed(beside)], [beside, last]])
+    first = first - matmul(coupling.mT, beside)
+    whole = jnp.block([[first, beside.mT], [beside, last]])
     return whole, jnp.concatenate([values, others], axis=1)
 
 
@@ -124,7 +124,7 @@ def _by_blocks(invert: Callable[[Array, Array], Inverses], size: int, matrices: 
         return _swept(a, rows, inverses, at), jax.lax.dynamic_update_slice_in_dim(pivots, of_block, at, axis=1)
 
     a, pivots = jax.lax.fori_loop(0, whole // size, sweep, (a, jnp.zeros((m, whole), a.dtype)))
-    # All but one of these pivots are positive: 1 from the padding, or eigenvalues that are not smaller.
+    # All these pivots except one are positive: the padding has pivots 1, and eigenvalues that displace them are larger.
     last = jnp.prod(pivots[:, n - 1 :], axis=1, keepdims=True)
     return -a[:, :n, :n], jnp.concatenate([pivots[:, : n - 1], last], axis=1)
 
@@ -138,7 +138,7 @@ def _swept(a: Matrices, rows: Float[Array, "m s n"], inverses: Float[Array, "m s
     index, own = jnp.arange(a.shape[1], dtype=at.dtype), at + jnp.arange(rows.shape[1], dtype=at.dtype)
     inside = (index >= at) & (index < at + rows.shape[1])
     rows = jnp.where(inside, -(index[None] == own[:, None]).astype(a.dtype), rows)
-    change = matmul(transposed(rows), matmul(inverses, rows))
+    change = matmul(rows.mT, matmul(inverses, rows))
     return jnp.where(inside, 0, jnp.where(inside[:, None], 0, a)) - change
 
 

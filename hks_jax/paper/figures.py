@@ -41,7 +41,7 @@ SIZES: dict[str, tuple] = {
 """The nodes per axis of quick and full runs, and for Figure 1 the number of eigenpairs."""
 TIMES = {"figure1": 1.0, "figure2": 0.01, "figure3": 1.0, "figure4": 0.01, "figure5": 0.25}
 LENGTHS = (5.0, 10.0, 20.0, 40.0)
-"""The distances of heat flow in Figure 6 in mm, √(t / mean diffusivity or its inverse)."""
+"""The distances √(t/s) of heat flow in Figure 6 in mm, where s is the mean diffusivity or its inverse."""
 DRAWN = 200
 """The vertices per axis of the drawn surface in Figure 1."""
 ANGLES = ("0", "π/4", "π/2", "3π/4", "π", "5π/4", "3π/2")

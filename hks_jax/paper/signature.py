@@ -30,8 +30,7 @@ def signature(
 ) -> Float[np.ndarray, "n_times *shape"]:
     """Return the HKS from k eigenpairs at the given times."""
     with warnings.catch_warnings():
-        # These domains are symmetric, so k often cuts a multiple eigenvalue. The last pairs are negligible at all times
-        # here.
+        # These domains are symmetric, so k often cuts a multiple eigenvalue. The last pairs are negligible here.
         warnings.filterwarnings("ignore", "k = .* cuts a multiple eigenvalue", AccuracyWarning)
         pairs = eigenpairs(domain, k, boundary)
     return np.asarray(hks(pairs, np.asarray(times), normalisation))
@@ -53,7 +52,7 @@ def flat_signature(
 ) -> Float[np.ndarray, "*shape"]:
     """Return 4πt·HKS, which is 1 where a metric is flat and its boundary is far.
 
-    It uses the whole spectrum on small grids, and the eigenpairs up to exp(−λₖt) ≈ exp(−exponent) on large grids.
+    The whole spectrum is used on small grids, and eigenpairs up to exp(−λₖt) ≈ exp(−exponent) on large grids.
     """
     if math.prod(field.grid.shape) > SMALL:
         return signature(field, [time], enough_pairs(field, time, boundary, exponent), boundary, "flat")[0]

@@ -26,7 +26,7 @@ INDEPENDENT = {50: 0.0580, 100: 0.0223, 200: 0.0056, 400: 0.00085}
 
 
 class Row(NamedTuple):
-    """One line of the table; the fields are the CSV's columns."""
+    """One line of the table; the fields are the columns of the CSV file."""
 
     nodes_per_axis: int
     eigenpairs: int

@@ -1,6 +1,6 @@
 """Violations of the triangle inequality by edge lengths in the metric, a remark of the paper.
 
-The remark concerns discrete exterior calculus. Diagonals cut the grid's cells, and `LENGTHS` gives rules for lengths.
+The remark concerns discrete exterior calculus. Diagonals cut cells into triangles; `LENGTHS` has rules for lengths.
 """
 
 from collections.abc import Callable
@@ -102,8 +102,8 @@ def make(full: bool, echo: Callable[[str], None]) -> dict[str, str]:
     lines = [
         "# Edge lengths in the metric, and the triangle inequality",
         "",
-        "The table counts triangles that violate it, for each rule of edge lengths, and vertices whose circumcentric",
-        "dual cell has no positive area (with midpoint lengths).",
+        "The table counts triangles that violate the inequality, for each rule of edge lengths, and vertices whose",
+        "circumcentric dual cell has no positive area (with midpoint lengths).",
         "",
         f"| field | triangles | {' | '.join(LENGTHS)} | vertices | without area |",
         "| --- |" + " ---: |" * (len(LENGTHS) + 3),

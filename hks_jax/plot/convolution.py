@@ -19,7 +19,7 @@ PIXELS_PER_INCH = 110
 """The texture's resolution, at which single grains are visible in print and on screens."""
 
 FRAME = 3
-"""The width of the frame in pixels, which exceeds the length of a step."""
+"""The width of the border around the arrays of pixels, which exceeds the length of a step."""
 
 
 def lic_texture(
@@ -28,8 +28,8 @@ def lic_texture(
     """Return white noise averaged along the integral lines of an eigenvector field (Cabral and Leedom 1993).
 
     An eigenvector has no sign, so each step takes the sign that continues the line. The average has bell-shaped
-    weights. It is divided by its standard deviation and mapped by the normal distribution function, so it is uniform in
-    (0, 1) for any number of pixels. So the contrast is the same where lines end, at degenerate points and boundaries.
+    weights. The average is divided by its standard deviation and mapped by the normal distribution function to uniform
+    numbers in (0, 1). So the contrast is the same where lines end, at degenerate points and boundaries.
 
     Args:
         field: a 2D field.
@@ -60,8 +60,8 @@ def lic_texture(
     centres = np.moveaxis(np.indices(shape), 0, -1).reshape(-1, 2) + 0.5
     points = [x0, y0] + centres * size
     noise = np.random.default_rng(seed).standard_normal(shape).astype(np.float32)
-    # For steps of one pixel the direction at every pixel suffices. Complex numbers represent vectors, and a frame of
-    # NaN ends lines that leave the image. Explicit tests for this would take most of the time.
+    # For steps of one pixel the direction at every pixel suffices. Complex numbers represent vectors, and a border of
+    # NaN ends lines that leave the image. Explicit tests for the image's sides would take most of the time.
     along = _complex(direction(points) / size * side).reshape(shape)
     along, values = np.pad(along, FRAME, constant_values=np.nan), np.pad(noise, FRAME)
     total, squares = noise.ravel().copy(), np.ones(noise.size, np.float32)

@@ -45,8 +45,7 @@ def hks_curves(
         grid: the grid of the values, 2D or 3D.
         points: (n, d) coordinates, one row for each curve.
         expansion: (n_times, *shape) the result of `hks_jax.hks_expansion`.
-        limit: the least time that the eigenpairs resolve, `hks_jax.truncation(pairs, times).smallest_time`. Times below
-            it are shaded.
+        limit: the least resolved time, `hks_jax.truncation(pairs, times).smallest_time`, below which times are shaded.
         labels: a label for each point, by default its coordinates.
         unit: the unit of t.
         scaled: whether to draw (4πt)^(d/2)·HKS, which is 1 for flat space without boundary, on a linear scale.
@@ -74,7 +73,7 @@ def hks_curves(
     lines = []
     for node, label, colour in zip(nodes, labels, colours, strict=True):
         lines += ax.plot(t, factor * curves[node], **{"color": colour, "label": label, **kwargs})
-    limits = ax.get_ylim()  # of the curves, because the series diverges at large t
+    limits = ax.get_ylim()  # without the expansion, because it diverges at large t
     if series is not None:
         for node, line in zip(nodes, lines, strict=True):
             ax.plot(t, factor * series[node], color=line.get_color(), linestyle="--", linewidth=1.0)
@@ -118,10 +117,10 @@ def spectrum(
     Args:
         ax: the axes to draw on.
         pairs: the result of `eigenpairs`; pairs that are not kept are omitted.
-        domain: the field or mesh of the pairs, for the second term of the law, which belongs to the boundary. Without
-            it only the first term is drawn.
-        remainder: whether to draw N(λ) minus the law. This difference has no trend, but it falls if eigenvalues are
-            missing or if the grid is too coarse for the last ones, because finite-element eigenvalues are too large.
+        domain: the field or mesh of the pairs, for the second term of the law, which belongs to the boundary. Without a
+            domain only the first term is drawn.
+        remainder: whether to draw N(λ) minus the law. This difference has no trend, but falls if eigenvalues are
+            missing, or are too large on a coarse grid.
         unit: the unit of λ.
         **kwargs: arguments of `Axes.plot` for N.
 

@@ -37,14 +37,14 @@ def fit_panels(
 ) -> Figure:
     """Return a figure of a fit in 2D with signatures, the metric and the loss.
 
-    A few times, including the first and the last, have a row each. It shows the target, the fitted signature in the
-    same colours, and their relative difference in colours that all rows share. Below are the unit circles of the fitted
+    Each of a few times, including the first and the last, has a row with the target, the fitted signature in the same
+    colours, and their relative difference in colours that all rows share. Below are the unit circles of the fitted
     metric and the loss over the steps, with a curve for each start.
 
     Args:
         fit: the result of `hks_jax.fit_metric`.
         target: (n_times, *grid.shape) the target of the fit; NaN at unobserved entries.
-        times: (n_times,) times or energies, by default those of the fit.
+        times: (n_times,) times or energies, by default the fit's.
         max_times: the maximum number of rows with times.
         title: the figure's title.
         orientation: the orientation of the grid in space, as for `scalar_image`.

@@ -51,7 +51,7 @@ def ellipses(
         **kwargs: arguments of `matplotlib.collections.EllipseCollection`.
 
     Raises:
-        ValueError: if the field is 3D, if an option is unknown, or if there is no node to draw.
+        ValueError: if the field is 3D, if an option is unknown, or if no node can be drawn.
 
     Examples:
         >>> marks = hj.plot.ellipses(hj.plot.new_figure(3, 3).add_subplot(), field, every=1)
@@ -67,7 +67,7 @@ def ellipses(
     steps, pick = nodes_drawn(grid, every, ax)
     inside = grid.inside[pick]
     if not inside.any():
-        raise ValueError(f"every: got {every}, with which no drawn node lies inside the mask; use a smaller step")
+        raise ValueError(f"every: got {every}, for which no drawn node lies inside the mask; use a smaller step")
     tensors = np.asarray(field.tensors, dtype=np.float64)[pick][inside]
     centres = grid.nodes[pick][inside]
 

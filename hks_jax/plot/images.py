@@ -17,7 +17,7 @@ from hks_jax.plot.orientation import Orientation
 FADED = 2.0
 """The number of standard deviations above which values are not faded as noise."""
 FAR = 1.5
-"""The least ratio of a median to a centre for which the values are far from the centre."""
+"""The ratio of the median of the values to the centre above which the colours have no centre."""
 RULES = ("quantiles", "least_range", "centre", "vmin", "vmax")
 """The arguments of `scalar_image` that determine the values of the first and the last colour."""
 
@@ -49,12 +49,12 @@ def scalar_image(
         vmin: the value of the first colour, by default from `quantiles`.
         vmax: the value of the last colour, by default from `quantiles`.
         centre: the value of the middle colour unless vmin and vmax are given, such as 1 for 4πt·HKS, its value for a
-            flat metric. The colours reach equally far above and below, for values ≥ 0 down to 0 at most. There is no
-            centre if most values are ≥ 0 and far above it.
-        quantiles: the quantiles of the values with the first and the last colour, unless vmin and vmax are given. The
-            colour bar has arrows if values lie beyond.
-        least_range: the least difference of the values of the last and the first colour, relative to the larger. It
-            prevents colours from showing rounding or discretisation errors of a constant.
+            flat metric. The colours reach equally far above and below it, but not below 0 if all values are ≥ 0. There
+            is no centre if all values are ≥ 0 and most are far above it.
+        quantiles: the quantiles of the values that get the first and the last colour, unless vmin and vmax are given.
+            The colour bar has arrows if values lie beyond.
+        least_range: the least difference between the values of the first and the last colour, relative to the larger
+            value. A larger range prevents colours from showing rounding or discretisation errors of a constant.
         colorbar: whether to add a colour bar.
         label: the colour bar's label.
         orientation: the orientation of the grid in space, which turns the image and adds space coordinates and letters.
@@ -186,15 +186,15 @@ def panel_colours(
     shared: bool = False,
     **kwargs: Any,
 ) -> list[dict[str, Any]]:
-    """Return the arguments of `scalar_image` for each image, given those for all images.
+    """Return the arguments of `scalar_image` for each image, given the arguments for all images.
 
-    Either `limits` contains the values of the first and the last colour for each image, or they follow from the values,
-    of all images together if `shared` is set.
+    The values of the first and the last colour of each image are its `limits`. Without limits they follow from the
+    values of the image, or of all images together if `shared` is set.
     """
     rules = {name: kwargs.pop(name) for name in RULES if name in kwargs}
     if limits is not None:
         if len(limits) != len(images):
-            raise ValueError(f"limits: got {len(limits)}; expected {len(images)}, one pair per time")
+            raise ValueError(f"limits: got {len(limits)} pairs; expected {len(images)}, one pair per time")
         return [{**kwargs, "vmin": low, "vmax": high} for low, high in limits]
     values = [image.compressed() for image in images]
     colours = colours_of([np.concatenate(values)], **rules) * len(values) if shared else colours_of(values, **rules)

@@ -1,4 +1,4 @@
-"""The orientation of images: arrays are turned so that their axes are as close as possible to those of space."""
+"""The orientation of images: arrays are turned so that their axes are as close as possible to the axes of space."""
 
 from collections.abc import Sequence
 from itertools import permutations
@@ -21,15 +21,15 @@ class Orientation(NamedTuple):
     """The directions of an array's axes in space, by which its image is turned.
 
     The image does not depend on the storage order of the voxels. In the order left–right, back–front, foot–head its
-    horizontal axis precedes its vertical axis, and letters at its edges name the directions. The radiological view
-    swaps left and right.
+    horizontal axis precedes its vertical axis, and letters at its edges name the directions. The radiological view is
+    mirrored.
 
     Attributes:
         axes: the array's axis for each axis of the image.
         turned: whether the array's axis has the opposite direction, for each axis of the image.
         ends: the letters of the low and the high end, for each axis of the image.
-        origin: the coordinate of the array's first node, for each axis of the image. These are space coordinates for
-            voxels along the axes of space, and coordinates along the voxel axes for oblique voxels.
+        origin: the coordinate of the array's first node, for each axis of the image. The coordinates are space
+            coordinates for voxels along the axes of space, and coordinates along the voxel axes for oblique voxels.
         view: ``"neurological"`` (left is on the left) or ``"radiological"`` (left is on the right).
 
     Examples:
@@ -67,7 +67,7 @@ class Orientation(NamedTuple):
         steps = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)
 
         def nearness(order: tuple[int, ...]) -> tuple[float, ...]:
-            """Return the closeness of the axes to those of space and, to break ties, their directions."""
+            """Return the closeness of the axes to the axes of space and, to break ties, their directions."""
             cosines = np.diag(steps[:, order])
             return tuple(np.round([np.abs(cosines).sum(), *(steps[:, order] * np.sign(cosines)).ravel()], 6).tolist())
 

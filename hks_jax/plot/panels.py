@@ -45,12 +45,12 @@ def hks_panels(
         path: the file in which to save the figure, if given.
         suptitle: the figure's title.
         orientation: the same as for `scalar_image`.
-        z: (n_times, *shape), by which values within the noise fade as in `scalar_image`.
+        z: (n_times, *shape); values within the noise fade as in `scalar_image`.
         **kwargs: arguments of `scalar_image` for all images, such as cmap, vmin, vmax, centre, quantiles, least_range
             and label.
 
     Raises:
-        ValueError: if shapes disagree or there is no time.
+        ValueError: if shapes disagree, or if no time is given.
 
     Examples:
         >>> fig = hj.plot.hks_panels(hj.hks(pairs, [0.2, 0.5]), [0.2, 0.5], field.grid)
@@ -101,7 +101,7 @@ def time_rows(
         suptitle: the figure's title.
 
     Raises:
-        ValueError: if there are no rows or times, or if values are not one image per time.
+        ValueError: if no rows or no times are given, or if values are not one image per time.
 
     Examples:
         >>> fig = hj.plot.time_rows({"HKS": hj.hks(pairs, [0.2, 0.5])}, [0.2, 0.5], field.grid)
@@ -129,7 +129,7 @@ def time_rows(
 
 
 def checked_times(times: Any, shape: tuple[int, ...], **arrays: Any) -> Float[np.ndarray, " n_times"]:
-    """Return the times; raise ValueError unless there is a time and each array has one value per time and node."""
+    """Return the times; raise ValueError unless each array has one value per time and node, for at least one time."""
     t = np.atleast_1d(np.asarray(times, dtype=np.float64))
     for name, array in arrays.items():
         if array is not None and (np.shape(array) != (t.size, *shape) or t.ndim != 1 or t.size == 0):
@@ -145,5 +145,5 @@ def panel_titles(t: Float[np.ndarray, " n_times"], titles: Sequence[str] | None,
     if titles is None:
         return [f"$t$ = {number_text(s)} {unit}".rstrip() for s in t]
     if len(titles) != t.size:
-        raise ValueError(f"titles: got {len(titles)}; expected {t.size}, one per time")
+        raise ValueError(f"titles: got {len(titles)} titles; expected {t.size}, one per time")
     return titles

@@ -26,7 +26,7 @@ METRICS = {"tensor": "D", "inverse": "D⁻¹", "adjugate": "|D|D⁻¹"}
 LEAST_RANGE = 0.01
 """The least range of the colours relative to the values, below which contrast is not enhanced."""
 RIM = 5
-"""The least distance from the boundary, in nodes, of values that set the colours. The HKS is higher near it."""
+"""The least distance from the boundary, in nodes, of values that set the colours, because the HKS is higher near it."""
 
 
 def signature_panels(
@@ -40,8 +40,8 @@ def signature_panels(
     """Return a figure of a signature on a slice, or on three slices of a volume, with separate colours for each time.
 
     The colours span the values away from the boundary, and a colour bar has arrows if other values lie beyond. With
-    "flat" normalisation they diverge from 1, the value for a flat metric, unless most values are far above 1. With
-    error bars, deviations within the noise fade. Titles contain √(Dt), the distance of diffusion, if it is known.
+    "flat" normalisation the colours diverge from 1, the value for a flat metric, unless most values are far above 1.
+    With error bars, deviations within the noise fade. Titles contain √(Dt), the distance of diffusion, if it is known.
 
     Args:
         result: the signature to draw.
@@ -103,7 +103,7 @@ def titles_of(result: Result) -> Sequence[str]:
 def _colours(result: Result, inside: Bool[np.ndarray, "*shape"]) -> list[Colours]:
     """Return the colours for each time, which span nearly all values away from the boundary."""
     rim = normalise_boundary(result.settings.get("boundary", "neumann"), inside.ndim)[-1]
-    # For "mean" the boundary is no exception, apart from its corners and, in a volume, thin parts of the mask.
+    # With "mean" the boundary has no effect, except at corners and, in a volume, in thin parts of the mask.
     deep = inside if "mean" in rim and inside.ndim == 2 else away_from_rim(inside)
     span = (0.01, 0.99) if "mean" in rim else SPAN
     centre = 1.0 if result.normalisation == "flat" else None

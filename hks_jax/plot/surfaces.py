@@ -46,7 +46,7 @@ def surface(
     Args:
         ax: three-dimensional axes, from ``fig.add_subplot(projection="3d")``.
         mesh: a surface or solid mesh. Drawing tens of thousands of triangles takes a few seconds.
-        values: (V,) a value for each vertex. A triangle has the mean of its three values.
+        values: (V,) a value for each vertex. A triangle has the colour of the mean of its three values.
         cmap: colour map.
         vmin: the value of the first colour, by default the least value.
         vmax: the value of the last colour, by default the greatest value.
@@ -89,7 +89,7 @@ def surface(
     thin = np.maximum(1e-3 * (high - low).max() - (high - low), 0) / 2  # a flat surface also needs a box
     low, high = low - thin, high + thin
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    ax.set_box_aspect(tuple(high - low), zoom=0.8 * zoom if thin.any() else zoom)  # a flat surface shows its corners
+    ax.set_box_aspect(tuple(high - low), zoom=0.8 * zoom if thin.any() else zoom)  # shows a flat surface's corners
     ax.set_axis_off()
     return mappable
 
@@ -123,7 +123,7 @@ def isosurfaces(
         cmap: colour map.
         vmin: the value of the first colour, by default from `quantiles`.
         vmax: the value of the last colour, by default from `quantiles`.
-        quantiles: the quantiles of the values with the first and the last colour, unless vmin and vmax are given.
+        quantiles: the quantiles of the values that get the first and the last colour, unless vmin and vmax are given.
         opacity: the opacity of each surface, above 0 and at most 1.
         view: the direction from the volume to the viewer; z is up.
         zoom: the size of the volume in its axes.
@@ -146,7 +146,7 @@ def isosurfaces(
     ((low, high, _),) = colours_of([array.compressed()], quantiles, vmin=vmin, vmax=vmax)
     heights = np.linspace(low, high, levels + 2)[1:-1] if isinstance(levels, int) else np.asarray(levels, np.float64)
     if heights.ndim != 1 or not heights.size or not np.isfinite(heights).all():
-        raise ValueError(f"levels: got {levels}; expected a number of at least 1, or finite values")
+        raise ValueError(f"levels: got {levels}; expected a positive number of levels, or finite values")
     if not 0 < opacity <= 1:
         raise ValueError(f"opacity: got {opacity}; expected a number in (0, 1]")
     if not np.isfinite(view).all() or np.hypot(view[0], view[1]) == 0:

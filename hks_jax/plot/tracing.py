@@ -1,8 +1,7 @@
 """Integral lines of the eigenvector fields of a 2D tensor field.
 
 An eigenvector has no sign, but the tensor is unambiguous. So the tensors at the nodes are interpolated bilinearly. The
-direction at a point follows from the interpolated tensor in closed form, and its sign from the line's previous
-direction.
+direction at a point follows from the interpolated tensor in closed form, and its sign from the previous direction.
 """
 
 from typing import Any, Literal
@@ -19,7 +18,7 @@ from hks_jax.plot.figure import frame, require_plane, side_in_inches
 
 Which = Literal["major", "minor"]
 
-# A line ends where (λ₁ − λ₂)/(λ₁ + λ₂) falls below this, or where it would turn by more than 60° in a step.
+# A line ends where (λ₁ − λ₂)/(λ₁ + λ₂) falls below `DEGENERATE`, or where it would turn by more than 60° in a step.
 DEGENERATE = 1e-3
 LEAST_COSINE = 0.5
 
@@ -37,7 +36,7 @@ class DirectionField:
         grid = field.grid
         tensors = np.asarray(field.domain_tensors, dtype=np.float64)
         self.which = which
-        # (a, b) is λ₁ − λ₂ times (cos 2θ, sin 2θ) for the major angle θ. Division by the trace makes it dimensionless.
+        # (a, b) is λ₁ − λ₂ times (cos 2θ, sin 2θ) for the major angle θ. Division by the trace removes the unit.
         difference = tensors[..., 0, 0] - tensors[..., 1, 1]
         components = np.stack([difference, 2 * tensors[..., 0, 1], np.trace(tensors, axis1=-2, axis2=-1)], -1)
         components[~grid.inside] = np.nan
@@ -102,7 +101,7 @@ def evenly_spaced_lines(
 ) -> list[Float[np.ndarray, "m 2"]]:
     """Return integral lines that fill the domain with a distance of about `separation`, in coordinates.
 
-    The method is that of Jobard and Lefer, “Creating evenly-spaced streamlines of arbitrary density” (1997). The next
+    The method is due to Jobard and Lefer, “Creating evenly-spaced streamlines of arbitrary density” (1997). The next
     line starts as close as allowed to the existing lines. A line ends where it is closer than half the separation to
     another line or to itself. Circles are closed.
 
@@ -149,7 +148,7 @@ def _grow(forward: np.ndarray, backward: np.ndarray, others: cKDTree | None, gap
     """Cut a line where it is closer than `gap` to the others or to itself; join its ends if they meet."""
     if others is not None:
         forward, backward = (half[: _first(others.query(half)[0] < gap)] for half in (forward, backward))
-    # Points at this distance along the line are not mere neighbours on the line.
+    # Points that are fewer steps apart may be close just because they are neighbours on the line.
     lag = int(np.ceil(np.pi * gap / step)) + 1
     end = _first_return(forward, lag, gap)
     if end < len(forward):

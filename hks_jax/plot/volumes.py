@@ -60,17 +60,15 @@ def orthogonal_slices(
         axes: three axes, for the planes xy, xz and yz in this order.
         values: (*shape,), with NaN at nodes without a value.
         grid: the 3D grid of the values, whose spacing determines the aspect.
-        node: the indices (i, j, k) of the node, or else of the nearest node with a value; by default `middle_node` of
-            the finite values.
+        node: the indices (i, j, k) of the node. If it has no value, the nearest node with a value is used. By default
+            `middle_node` of the finite values.
         cross: whether thin lines show the positions of the other two slices.
-        orientation: the orientation of the grid in space, which turns the slices and adds space coordinates and
-            letters.
-        z: (*shape,), by which values within the noise fade as in `scalar_image`.
+        orientation: the orientation of the grid in space, which turns slices and adds coordinates and letters.
+        z: (*shape,); values within the noise fade as in `scalar_image`.
         **kwargs: arguments of `scalar_image` for the whole volume, such as cmap, vmin, vmax, centre, quantiles.
 
     Raises:
-        ValueError: if there are not three axes, if the grid is not 3D, or if the values have another shape or none is
-            finite.
+        ValueError: if there are not three axes, if the grid is not 3D, or if values have another shape or are all NaN.
 
     Examples:
         >>> axes, grid = hj.plot.new_figure(6, 2).subplots(1, 3), hj.Grid((5, 5, 5))
@@ -78,7 +76,7 @@ def orthogonal_slices(
         (0.0, 4.0)
     """
     if len(axes) != 3:
-        raise ValueError(f"axes: got {len(axes)}; expected 3, for the planes xy, xz and yz")
+        raise ValueError(f"axes: got {len(axes)} axes; expected 3, for the planes xy, xz and yz")
     require_volume(grid)
     noise = None if z is None else masked("z", z, grid)
     if noise is not None and orientation is not None:
@@ -132,11 +130,11 @@ def volume_panels(
         label: the colour bars' label.
         suptitle: the figure's title.
         orientation: the same as for `orthogonal_slices`.
-        z: (n_times, *shape), by which values within the noise fade as in `hks_panels`.
+        z: (n_times, *shape); values within the noise fade as in `hks_panels`.
         **kwargs: arguments of `scalar_image` for all volumes, such as cmap, centre and quantiles.
 
     Raises:
-        ValueError: if shapes disagree or there is no time, or as in `orthogonal_slices`.
+        ValueError: if shapes disagree, if no time is given, or as in `orthogonal_slices`.
 
     Examples:
         >>> grid = hj.Grid((5, 5, 5))
@@ -191,12 +189,12 @@ def require_volume(grid: Grid) -> None:
 def _turned(
     array: np.ma.MaskedArray, grid: Grid, node: Sequence[int] | None, orientation: Orientation | None
 ) -> tuple[np.ma.MaskedArray, Grid, tuple[int, ...]]:
-    """Return values, grid and node, or the nearest node with a value, in the order of the image."""
+    """Return values, grid and the nearest node with a value in the order of the image."""
     if node is not None:
         nodes = np.argwhere(~np.ma.getmaskarray(array))
         node = nodes[np.argmin(np.sum((nodes - np.asarray(node)) ** 2, axis=1))].tolist()
     if orientation is not None:
         node = None if node is None else orientation.node(node, grid.shape)
         array, grid = orientation.array(array), orientation.grid(grid)
-    # The middle is determined in the image, so that ties do not depend on the storage order.
+    # The middle is determined in the order of the image, so that ties do not depend on the storage order.
     return array, grid, middle_node(~np.ma.getmaskarray(array)) if node is None else tuple(node)

@@ -19,11 +19,11 @@ from hks_jax.signatures.filters import Filter, mixing
 
 _matmul = partial(jnp.matmul, precision="highest")
 _ON_HOST = 1 << 22
-"""The number of entries of the eigenvectors, and of all filters' matrices, up to which NumPy differentiates."""
+"""The largest number of entries, of the eigenvectors or of all filters' matrices, for derivatives by NumPy."""
 
 
 class Contraction(eqx.Module):
-    """Values computed from the kernel Φ C Φᵀ with C (k, k). They are linear in the array leaves of this object."""
+    """A function of the kernel Φ C Φᵀ with a matrix C (k, k), linear in the kernel and in its own array leaves."""
 
     @abstractmethod
     def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m *s n"]:
@@ -33,7 +33,7 @@ class Contraction(eqx.Module):
     def mixed(
         self, matrices: Float[Array, "m k k"], vectors: Float[Array, "k n"], matters: Bool[Array, "m k"]
     ) -> Float[Array, "m *s n"]:
-        """Return the values for each symmetric C. Its entries are negligible where neither row nor column matters."""
+        """Return the values for each symmetric C. Cᵢⱼ is negligible where ``matters`` is false for i and for j."""
 
 
 class Diagonal(Contraction):
@@ -125,7 +125,7 @@ def shapes(contraction: Contraction, filters: Filter, pairs: tuple[Array, Array,
 
 
 def by_numpy(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
-    """Return the derivative of a diagonal, or the cotangents of `d_frame` and of the change of the pencil, by NumPy."""
+    """Return the derivative of a diagonal, or its cotangents, by NumPy; None if JAX should compute them."""
     contraction, filters, pairs, _, selection, fixed, copies, space, _, reader = known
     values, vectors, kept = map(np.asarray, pairs)
     k = len(values) if selection is None else len(selection[0])

@@ -51,7 +51,7 @@ def biharmonic_distance(pairs: Eigenpairs, sources: Any) -> Float[Array, "n_sour
         sources: node indices (n_sources, d), or (d,) for one source; vertex numbers on a mesh.
 
     Raises:
-        ValueError: if a source is outside the domain, if it has several components, or if no eigenvalue is positive.
+        ValueError: if a source is outside the domain, if the domain is not connected, or if no eigenvalue is positive.
 
     Examples:
         >>> d = hj.biharmonic_distance(pairs, [(0, 0), (8, 8)])
@@ -62,7 +62,7 @@ def biharmonic_distance(pairs: Eigenpairs, sources: Any) -> Float[Array, "n_sour
     if known and pairs.n_null > 1:
         raise ValueError(
             f"pairs: got eigenpairs of {pairs.n_null} components, between which the biharmonic distance is infinite; "
-            "expected one. Compute the eigenpairs of each component separately"
+            "expected one component. Compute the eigenpairs of each component separately"
         )
     positive_range(pairs)
     return _distance(pairs, Power(jnp.full(1, -2.0, pairs.eigenvalues.dtype)), sources)[0]
@@ -85,8 +85,8 @@ def shape_dna(pairs: Eigenpairs, normalise: bool = True) -> Float[Array, " k"]:
     """
     values = pairs.eigenvalues
     if normalise:
-        dimension = dimension_of(pairs, "ShapeDNA that is normalised")
-        values = values * volume_of(pairs, "ShapeDNA that is normalised") ** (2 / dimension)
+        dimension = dimension_of(pairs, "normalised ShapeDNA")
+        values = values * volume_of(pairs, "normalised ShapeDNA") ** (2 / dimension)
     # NaN is inserted last because the product 0·NaN would otherwise enter the derivative of the volume.
     return nan_outside(values, pairs.kept)
 
@@ -110,7 +110,7 @@ def global_point_signature(pairs: Eigenpairs) -> Float[Array, "m *shape"]:
 
 
 MARGIN = 10.0
-"""The least ratio of a kernel to its truncation error. The error of its logarithm is then at most about 0.1."""
+"""The least accepted ratio of a kernel to its truncation error. The kernel's logarithm then has an error of 0.1."""
 GRID_LIMIT = 0.1
 """The largest accepted relative error of a squared distance due to the grid spacing."""
 
@@ -128,15 +128,15 @@ def varadhan_distance(
     Small times need fine grids and many pairs: linear elements with node spacing h have the relative error h²d²/48t² of
     d², and exp(−d²/4t) must exceed the truncation and rounding errors. The result is NaN where the estimated relative
     error of the kernel or the grid's relative error of d² exceeds 0.1, outside the mask, and at Dirichlet nodes. Larger
-    times reach further, but with larger errors.
+    times resolve larger distances, but with larger errors.
 
     Args:
-        pairs: the result of `eigenpairs`; more pairs reach further. Paths stay in the domain: they go around holes of
-            its mask and across periodic sides. Under ``"mirror"`` and ``"mean"`` straight sides have no effect.
+        pairs: the result of `eigenpairs`; more pairs resolve larger distances. Paths stay in the domain: they go around
+            holes and across periodic sides. Under ``"mirror"`` and ``"mean"`` straight sides have no effect.
         times: (n_times,) positive, in (metric length)²; a time of about d·h suits the distance d.
         sources: node indices (n_sources, d), or (d,) for one source; vertex numbers (n_sources,) on a mesh.
-        normalised: whether to divide by the diagonal. Otherwise the result depends on the length unit and is NaN where
-            k_t > 1.
+        normalised: whether to divide by the diagonal. Otherwise the result depends on the unit, and is NaN where k_t >
+            1.
 
     Raises:
         ValueError: if times are invalid or if a source is out of range, outside the mask or at a Dirichlet node.
@@ -165,7 +165,7 @@ def varadhan_distance(
     _warn_of_distance(pairs, times, relative, by_pairs, by_grid)
     defined = relative > jnp.maximum(by_pairs, by_grid)
     if normalised:
-        # At distance zero the root has no derivative and the kernel may differ from 1 by rounding, so the value is set.
+        # At distance zero the root has no derivative and the kernel may differ from 1 by rounding, so 0 is inserted.
         numbers = np.arange(space.domain.size).reshape(1, *space.node_shape)
         zero = (relative >= 1) | (numbers == _broadcast(nodes, space))[None]
     else:
@@ -181,8 +181,8 @@ def _broadcast(values: Any, space: FunctionSpace) -> Any:
     return values.reshape(*values.shape, *[1] * len(space.node_shape))
 
 
-# By the Cauchy–Schwarz inequality the errors of the normalised kernel are about as large as those of its diagonal. They
-# are the tail's share, from truncation, and the mean of the residuals with the weights of the trace.
+# By the Cauchy–Schwarz inequality the errors of the normalised kernel are about as large as the errors of its diagonal.
+# The errors of the diagonal are the truncated share of the trace, and the residuals weighted by the terms of the trace.
 #
 # Linear elements have the eigenvalue ξ² (1 + ξ²h²/12) and the mass 1 − ξ²h²/6 at the frequency ξ along an axis. In the
 # kernel ∫ exp(iξd − tλ)/m dξ the means of powers of ξ are ⟨ξ²⟩ = (2t − d²)/4t² and ⟨ξ⁴⟩ = (d⁴ − 12td² + 12t²)/16t⁴. To
@@ -192,7 +192,7 @@ def _broadcast(values: Any, space: FunctionSpace) -> Any:
 def _least_kernels(
     pairs: Eigenpairs, times: Float[Array, " m"], nodes: Int[np.ndarray, " s"]
 ) -> tuple[Float[Array, "m 1 *ones"], Float[Array, "m s *shape"]]:
-    """Return the least normalised kernels that the pairs and the grid resolve."""
+    """Return the least normalised kernel that the pairs resolve, and the least that the grid resolves."""
     pairs, times = jax.lax.stop_gradient((pairs, times))
     space, resolution = pairs.space, pairs.pencil.resolution
     if resolution is None:
@@ -201,8 +201,7 @@ def _least_kernels(
     residuals = jnp.sum(weights * jnp.where(pairs.kept, pairs.residuals, 0)[None], axis=1) / jnp.sum(weights, axis=1)
     error = MARGIN * truncation(pairs, times).tail + residuals + 100 * jnp.finfo(times.dtype).eps
     at_nodes = jnp.where(space.free, jnp.square(resolution.mesh_width), 0)
-    # The spacing along the geodesic is not known. Use the larger of two values: the spacing at its
-    # ends, and the mean spacing of the domain.
+    # The spacing along the geodesic is not known. The spacing at its ends or, if larger, the mean spacing is used.
     along = jnp.maximum(
         jnp.maximum(at_nodes[None], _broadcast(at_nodes.ravel()[nodes], space)), jnp.sum(at_nodes) / space.n_dof
     )

@@ -14,7 +14,7 @@ from hks_jax.linear.divided_differences import divided_difference, gauss
 
 
 class Filter(eqx.Module):
-    """An elementwise function f(λ) of the eigenvalue. Its parameters are differentiable array leaves.
+    """An elementwise function f(λ) of the eigenvalue, whose parameters are differentiable array leaves.
 
     Several filters are stored as one filter whose leaves have a leading axis, for `jax.vmap`.
     """
@@ -65,7 +65,7 @@ class Heat(Filter):
 
 
 class Wave(Filter):
-    """The filter exp(−(e − log λ)²/2σ² − c) of the wave kernel signature at energy e; it is 0 at λ = 0."""
+    """The filter exp(−(e − log λ)²/2σ² − c) of the wave kernel signature, with an offset c; it is 0 at λ = 0."""
 
     energy: Float[Array, "*m"]
     sigma: Float[Array, "*m"]
@@ -127,9 +127,9 @@ def weights_of(one: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"])
 def mixing(
     filters: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"], fixed: bool
 ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"], Float[Array, "m k k"], Bool[Array, "m k"]]:
-    """Return f(λᵢ), the divided differences [f] and [λf], and where f or λf' matters, for each filter.
+    """Return f(λᵢ), the divided differences [f] and [λf], and whether f or λf' matters at λᵢ, for each filter.
 
-    They do not matter where they are negligible relative to their largest size at positive eigenvalues.
+    A value does not matter if it is negligible relative to the largest value at positive eigenvalues.
     """
     rows, columns = values[:, None], values[None]
     low, high, gap = jnp.minimum(rows, columns), jnp.maximum(rows, columns), rows - columns
@@ -138,7 +138,7 @@ def mixing(
         f = weights_of(one, values, kept)
         quotient = (f[:, None] - f[None]) / jnp.where(gap == 0, 1, gap)
         of_f = jnp.where(kept[:, None] & kept[None], one.divided_difference(low, high), quotient)
-        # G vanishes between null vectors that every perturbation annihilates, and f may have no derivative at 0.
+        # Between null vectors that all perturbations annihilate, [f] has no effect, and f may have no derivative at 0.
         of_f = jnp.where((high == 0) & (fixed | ~jnp.isfinite(of_f)), 0, of_f)
         # Using f at the larger eigenvalue, where f is small, avoids cancellation.
         of_lambda_f = jnp.where(gap >= 0, f[:, None], f[None]) + low * of_f

@@ -23,12 +23,12 @@ from hks_jax.traced import is_traced
 def heat_flow(pairs: Eigenpairs, times: Any, functions: Any) -> Float[Array, "n_times *functions_and_shape"]:
     """Let functions diffuse on the domain: u(t) = Σᵢ exp(−λᵢt) φᵢ ∫φᵢu, the solution of ∂u/∂t = −Δu.
 
-    The diffusion is anisotropic where the metric is. The result is differentiable by functions, times and tensors.
-    It is NaN outside the mask, and 0 at Dirichlet nodes.
+    The diffusion is anisotropic where the metric is. The result is differentiable with respect to functions, times and
+    tensors. The result is NaN outside the mask, and 0 at Dirichlet nodes.
 
     Args:
-        pairs: the result of `eigenpairs`. Their boundary conditions also hold for u. Values of u at Dirichlet nodes are
-            not used. ``"mirror"`` and ``"mean"`` extend u evenly, which gives the same flow as ``"neumann"``.
+        pairs: the result of `eigenpairs`. The boundary conditions of the pairs also hold for u. Values at Dirichlet
+            nodes are not used. ``"mirror"`` and ``"mean"`` extend u evenly, which gives the same flow as ``"neumann"``.
         times: (n_times,) positive, in (metric length)².
         functions: (*shape), or (…, *shape) for several functions; values outside the mask are not used.
 
@@ -40,7 +40,7 @@ def heat_flow(pairs: Eigenpairs, times: Any, functions: Any) -> Float[Array, "n_
 
     Examples:
         >>> heat = hj.heat_flow(pairs, [0.2, 0.5], field.grid.nodes[..., 0])
-        >>> [round(float((pairs.pencil.mass @ u.ravel()).sum()), 2) for u in heat]  # none is lost
+        >>> [round(float((pairs.pencil.mass @ u.ravel()).sum()), 2) for u in heat]  # no heat is lost
         [1.0, 1.0]
     """
     times, shape = times_of(pairs, times), pairs.space.node_shape
@@ -83,7 +83,7 @@ def tensor_invariants(field: TensorField) -> dict[str, Float[np.ndarray, "*shape
     """Return the ``"trace"``, ``"determinant"`` and ``"anisotropy"`` of the tensors at the nodes; NaN outside the mask.
 
     The anisotropy is (λ₁ − λ₂)/(λ₁ + λ₂) in 2D and the fractional anisotropy (Basser and Pierpaoli 1996) in 3D. Both
-    are below 1, and 0 for multiples of the identity.
+    kinds of anisotropy are below 1, and 0 for multiples of the identity.
 
     Args:
         field: the tensors on a grid. Pass ``TensorField(Grid(shape), T)`` for an array T (*shape, d, d). For diffusion
@@ -115,10 +115,10 @@ def tensor_invariants(field: TensorField) -> dict[str, Float[np.ndarray, "*shape
 def gaussian_scale_space(
     field: TensorField, times: Any, functions: Any
 ) -> Float[np.ndarray, "n_times *functions_and_shape"]:
-    """Blur functions by an isotropic Gaussian that is as wide everywhere as the mean spread of heat.
+    """Blur functions by an isotropic Gaussian, whose constant width is the mean width to which heat spreads.
 
     In coordinates the standard deviation is √(2t/s), where s is the mean of |T|^(1/d) over the domain. Division by the
-    blurred mask and reflection at the sides of the grid preserve constant functions. NaN outside the mask.
+    blurred mask and reflection at the grid's sides preserve constants. The result is NaN outside the mask.
 
     Args:
         field: the metric, for its scale, its grid and its mask.
@@ -148,7 +148,7 @@ def gaussian_scale_space(
 def _blur(u: np.ndarray, inside: np.ndarray, sigma: float, spacing: tuple[float, ...]) -> np.ndarray:
     weight = inside.astype(float)
     for axis, h in enumerate(spacing):
-        # Three times the side blurs any function to a constant; wider kernels only take longer.
+        # A width of three times the grid's side blurs any function to a constant; wider kernels only take longer.
         nodes = min(sigma / h, 3.0 * inside.shape[axis])
         weight = scipy.ndimage.gaussian_filter1d(weight, nodes, axis=axis, mode="mirror")
         u = scipy.ndimage.gaussian_filter1d(u, nodes, axis=axis - len(spacing), mode="mirror")

@@ -43,10 +43,9 @@ class AutomaticHKS(eqx.Module):
         times: (n_times,).
         spectral: (n_times,) bool, true at times computed from eigenpairs, false at spectrum-free times.
         tail: (n_times,) the estimated share beyond the eigenpairs (`truncation`), by which the method was chosen.
-        method: the method of the spectrum-free times: ``"colouring"``, ``"selected-inversion"`` or, without any,
-            ``"none"``.
-        overlap_time: the shortest time of the eigenpairs, which was computed by both methods; NaN if no time was.
-        overlap_difference: the greatest difference of the two methods at that time, relative to (4πt)^(−d/2).
+        method: the method at spectrum-free times: ``"colouring"`` or ``"selected-inversion"``; ``"none"`` without them.
+        overlap_time: the shortest time computed from eigenpairs, at which the methods are compared, or NaN.
+        overlap_difference: the greatest difference at that time, relative to (4πt)^(−d/2); NaN if not compared.
     """
 
     values: Float[Array, "n_times *shape"]
@@ -66,7 +65,7 @@ class AutomaticHKS(eqx.Module):
             if some:
                 listed = ", ".join(some[:8]) + (" …" if len(some) > 8 else "")
                 lines.append(f"{len(some)} of {times.size} times by {name}: {listed}")
-        if math.isfinite(float(self.overlap_time)):
+        if math.isfinite(float(self.overlap_difference)):
             lines.append(
                 f"at t = {float(self.overlap_time):.4g} the two methods differ by {float(self.overlap_difference):.1e}"
             )
@@ -93,7 +92,7 @@ def hks(
         method: ``"spectral"`` sums over the pairs. ``"spectrum-free"`` uses only the matrices of the pairs (see
             `hks_spectrum_free`). ``"auto"`` uses the pairs at times that they resolve to the tolerance and the matrices
             at the other times. `hks_auto` also reports the choice and the agreement of the methods.
-        tolerance: the error allowed to the last two methods, relative to (4πt)^(−d/2).
+        tolerance: the allowed error of ``"spectrum-free"`` and ``"auto"``, relative to (4πt)^(−d/2).
 
     Raises:
         ValueError: if times are not positive and finite, if the normalisation or the method is unknown, if
@@ -128,13 +127,13 @@ def hks_auto(
 ) -> AutomaticHKS:
     """Compute the heat kernel signature with the suitable method at each time, and report the choice.
 
-    A time is computed from the eigenpairs if the estimated share beyond them is at most the tolerance, and otherwise by
-    `hks_spectrum_free`. If there are times of both kinds, the shortest time of the eigenpairs is computed by both
-    methods, provided that this takes at most ten times the work of the spectrum-free times.
+    The signature at a time is computed from the eigenpairs if the estimated share beyond them is at most the tolerance,
+    and otherwise by `hks_spectrum_free`. If there are times of both kinds, both methods are compared at the shortest
+    time of the eigenpairs, provided that this takes at most ten times the work of the spectrum-free times.
 
     Args:
         times: (n_times,) positive; the normalisation is as in `hks`.
-        tolerance: the error allowed to both methods, relative to (4πt)^(−d/2).
+        tolerance: the allowed error of both methods, relative to (4πt)^(−d/2).
 
     Raises:
         ValueError: as in `hks`, or if values are traced, because the choice depends on them.
@@ -151,8 +150,8 @@ def hks_auto(
     known_pairs, known_times = jax.lax.stop_gradient((pairs, times))
     if is_traced((known_pairs.eigenvalues, known_times)):
         raise ValueError(
-            'method: got "auto", which chooses by values that are traced here (jax.jit, vmap); expected "spectral" '
-            'or, for small times, "spectrum-free"'
+            'method: got "auto" with traced values (jax.jit, vmap), but the choice depends on values; expected '
+            '"spectral" or, for small times, "spectrum-free"'
         )
     estimate = truncation(known_pairs, known_times)
     spectral = np.asarray(estimate.tail) <= tolerance
@@ -165,7 +164,7 @@ def hks_auto(
     settings = choose_method(pencil, times[small], "auto", tolerance)
     raw = hks_spectrum_free(pencil, times[small], method=settings or "selected-inversion", tolerance=tolerance)
     others = _scaled(pairs, times[small], normalisation, raw)
-    # These times do not use the k pairs, so warn only about the grid.
+    # The signature at these times does not use the k pairs, so warn only about the grid.
     some = jax.tree.map(lambda leaf: leaf[small] if leaf.ndim else leaf, estimate)
     for message in eqx.tree_at(lambda e: e.tail, some, jnp.zeros(small.size)).messages():
         warn_of_accuracy(message)
@@ -238,12 +237,12 @@ def boundary_influence(
 ) -> Float[Array, "n_times *shape"]:
     """Return the share of the heat kernel signature that is due to the boundary, (k_N − k_D)/(k_N + k_D).
 
-    Here k_N ≥ k_D are the signatures with Neumann and with Dirichlet conditions on the whole boundary, also that of a
-    mask. At a distance d from a straight side of a flat domain the ratio is exp(−d²/t). It is 1 on the boundary and 0
-    where the boundary has no effect yet, whatever its conditions are; NaN outside the mask.
+    Here k_N ≥ k_D are the signatures with Neumann and with Dirichlet conditions on the whole boundary, including the
+    rim of a mask. At a distance d from a straight side of a flat domain the ratio is exp(−d²/t). The ratio is 1 on the
+    boundary, 0 where neither condition has an effect yet, and NaN outside the mask.
 
-    The result is differentiable with respect to the tensors. Two problems are solved for eigenpairs. Together they are
-    the problem with the boundary ``"mean"``, whose signature is (k_N + k_D)/2.
+    The result is differentiable with respect to the tensors. Eigenpairs of two problems are computed. Together the two
+    problems are the problem with the boundary ``"mean"``, whose signature is (k_N + k_D)/2.
 
     Args:
         domain: a metric in 2D or 3D, a mesh, or eigenpairs with the boundary ``"mean"``, which contain both problems.

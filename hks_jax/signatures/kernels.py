@@ -7,9 +7,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from hks_jax.checks import require_number, require_real
+from hks_jax.compilation import numpy_where_known
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Custom, Derivative, Heat, Wave
 from hks_jax.signatures.spectral_functions import source_indices, spectral_columns, spectral_diagonal, spectral_trace
@@ -46,7 +47,7 @@ def heat_kernel(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Array, "n_
 
     Examples:
         >>> heat = hj.heat_kernel(pairs, [0.2], (4, 4))[0, 0]
-        >>> print((pairs.pencil.mass @ heat.ravel()).sum().round(3))  # all of it
+        >>> print((pairs.pencil.mass @ heat.ravel()).sum().round(3))  # the total heat
         1.0
     """
     return spectral_columns(pairs, Heat(resolved_times(pairs, times)), source_indices(pairs, sources))
@@ -55,11 +56,11 @@ def heat_kernel(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Array, "n_
 def scale_invariant_hks(
     pairs: Eigenpairs, n_frequencies: int = 6, n_times: int = 256, times: Any = None
 ) -> Float[Array, "n_frequencies *shape"]:
-    """Compute the scale-invariant HKS (Bronstein and Kokkinos 2010): |FFT| of d/dτ log HKS(exp τ, x), low frequencies.
+    """Compute the scale-invariant HKS (Bronstein and Kokkinos 2010): |FFT(d/dτ log HKS(exp τ, x))| at low frequencies.
 
-    Scaling the metric by β shifts τ by log β² and lowers log HKS by a constant. The derivative removes the constant and
-    the modulus of the Fourier transform the shift. The default times scale with the spectrum, so invariance is exact.
-    The moduli are dimensionless, and NaN outside the mask and at Dirichlet nodes.
+    Scaling the metric by β shifts τ by log β² and lowers log HKS by a constant. The derivative removes the constant,
+    and the modulus of the Fourier transform removes the shift. The default times scale with the spectrum, so invariance
+    is exact. The moduli are dimensionless, and NaN outside the mask and at Dirichlet nodes.
 
     Args:
         n_frequencies: the number of Fourier moduli, from frequency 0.
@@ -123,14 +124,12 @@ def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Arr
     return spectral_diagonal(pairs, bells, 1 / spectral_trace(pairs, bells))
 
 
-@jax.jit
-def _largest_exponents(
-    energies: Float[Array, " n"], sigma: Float[Array, ""], values: Float[Array, " k"], kept: Bool[Array, " k"]
-) -> Float[Array, " n"]:
+@numpy_where_known()
+def _largest_exponents(xp: Any, energies: Any, sigma: Any, values: Any, kept: Any) -> Any:
     positive = kept & (values > 0)
-    logs = jnp.log(jnp.where(positive, values, 1))
-    exponents = jnp.where(positive[None], -jnp.square((energies[:, None] - logs[None]) / sigma) / 2, -jnp.inf)
-    return jnp.max(exponents, axis=1)
+    logs = xp.log(xp.where(positive, values, 1))
+    exponents = xp.where(positive[None], -(((energies[:, None] - logs[None]) / sigma) ** 2) / 2, -xp.inf)
+    return xp.max(exponents, axis=1)
 
 
 def spectral_signature(
@@ -161,7 +160,7 @@ def spectral_signature(
     parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), parameters)
     shapes = [leaf.shape for leaf in jax.tree.leaves(parameters)]
     if not shapes or len({shape[:1] for shape in shapes}) != 1 or not all(shapes):
-        raise ValueError(f"parameters: got arrays of shapes {shapes}; expected equal first axes: one entry per f")
+        raise ValueError(f"parameters: got arrays of shapes {shapes}; expected equal first axes, one entry per filter")
     filters = Custom(function, parameters)
     if sources is None:
         return spectral_diagonal(pairs, filters)

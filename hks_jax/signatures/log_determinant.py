@@ -24,7 +24,7 @@ _TIMES, _PER_DOUBLING = 12, 2
 _DOUBTFUL = 0.01
 """The estimated error above which a warning is issued."""
 _SMALL, _TERMS, _NODES = 2.0, 20, 32
-"""The largest argument for the series of E₁, its number of terms, and the quadrature points beyond; error 1e-14."""
+"""The largest argument for the series of E₁, its number of terms, and the quadrature points for larger arguments."""
 
 
 class LogDeterminant(NamedTuple):
@@ -32,9 +32,9 @@ class LogDeterminant(NamedTuple):
 
     Attributes:
         value: log det′ Δ.
-        error: an estimate of the discretisation error and of omitted terms of the heat trace; constant to derivatives.
-        time: T. The heat trace is computed from its coefficients up to T and from eigenvalues after T. T is constant to
-            derivatives.
+        error: an estimate of the discretisation error and of omitted terms of the heat trace; constant in derivatives.
+        time: the time T up to which the heat trace is computed from its coefficients, and after which from eigenvalues;
+            constant in derivatives.
     """
 
     value: Float[Array, ""]
@@ -51,10 +51,10 @@ def heat_coefficients(
 ) -> Float[Array, " 3"]:
     """Return a₀, a₁, a₂ of the heat trace Σ exp(−λᵢt) ~ a₀/t + a₁/√t + a₂ of a surface (Kac 1966; McKean, Singer 1967).
 
-    They are a₀ = V/4π, a₁ = ±L/8√π (+ for Neumann conditions) and a₂ = χ/6 + Σ (π − θ)²/24πθ over the corners.
+    These are a₀ = V/4π, a₁ = ±L/8√π (+ for Neumann conditions) and a₂ = χ/6 + Σ (π − θ)²/24πθ over the corners.
 
     Args:
-        pairs: the result of `eigenpairs` in 2D. V is the area, under "mirror" and "mean" that of the doubled domain.
+        pairs: the result of `eigenpairs` in 2D. V is the area, under "mirror" and "mean" of the doubled domain.
         euler_characteristic: χ, which is 2 for a sphere, 0 for a torus, and 1 for a disc or a square.
         boundary_length: L, in the units of the metric.
         corners: the inner angles θ of the boundary's corners, in radians; for a square, four times π/2.
@@ -97,9 +97,9 @@ def log_determinant(
 ) -> LogDeterminant:
     """Compute log det′ Δ = −ζ′(0), where ζ(s) = Σ λᵢ^(−s) is the sum over the positive eigenvalues.
 
-    The heat trace's expansion at small times supplies the part of the eigenvalues beyond the last. The result is
-    differentiable by the eigenvalues and the coefficients. Errors of the eigenvalues limit its accuracy: for linear
-    elements with spacing h in 2D the error is about a₀h²/16T², so many pairs and small T need fine grids.
+    The heat trace's expansion at small times accounts for the remaining eigenvalues. The result is differentiable with
+    respect to the eigenvalues and the coefficients. Errors of the eigenvalues limit the accuracy: for linear elements
+    with spacing h in 2D the error is about a₀h²/16T². So a small T requires many pairs and a fine grid.
 
     Args:
         pairs: the lowest eigenpairs, from `eigenpairs`.
@@ -125,7 +125,7 @@ def log_determinant(
     d, dtype = dimension_of(require_pairs(pairs), "the determinant"), pairs.eigenvalues.dtype
     a = jnp.asarray(coefficients, dtype)
     if a.ndim != 1 or a.size <= d:
-        raise ValueError(f"coefficients: got shape {a.shape}; expected at least {d + 1}, a₀ to a_{d}")
+        raise ValueError(f"coefficients: got shape {a.shape}; expected at least {d + 1} coefficients, a₀ to a_{d}")
     powers = np.asarray(extrapolate, float)
     if not (powers > 0).all() or len(set(powers)) != powers.size:
         raise ValueError(f"extrapolate: got {extrapolate}; expected distinct positive powers of t")
@@ -136,7 +136,7 @@ def log_determinant(
     _, last = jax.lax.stop_gradient(positive_range(pairs))
     steps = 2.0 ** (np.arange(_TIMES) / _PER_DOUBLING)
     times = _FIRST / last * jnp.asarray(steps, dtype) if time is None else jnp.asarray(time, dtype)[None]
-    # Values at (m,) times multiplied by 1, √2, 2, 2√2, …; the odd powers of √2 serve the error estimate.
+    # Values at each of m times multiplied by 1, √2, 2, 2√2, …; the odd powers of √2 serve the error estimate.
     count = powers.size + 1
     doublings = 2.0 ** (np.arange(2 * count + 1) / 2)
     values = _at(pairs, a, d, times[:, None] * jnp.asarray(doublings, dtype)[None])
@@ -144,7 +144,7 @@ def log_determinant(
     weights = np.linalg.solve(2.0 ** np.outer(np.append(0, powers), np.arange(count)), np.eye(count)[0])
     levels = [values[:, i : i + 2 * count : 2] @ jnp.asarray(weights, dtype) for i in range(3)]
     rest = jnp.maximum(jnp.abs(levels[0] - levels[1]), jnp.abs(levels[0] - levels[2]))
-    # The error of the trace of linear elements is d h²/16t, three times that of the signature at a node.
+    # The error of the trace of linear elements is d h²/16t, three times the error of the signature at a node.
     bias = 3 * truncation(pairs, times).resolution_bias * jnp.abs(a[0]) * times ** (-d / 2) / (d / 2 + 1)
     errors = jax.lax.stop_gradient(rest + jnp.where(jnp.isfinite(bias), bias, 0))
     best = jnp.argmin(jnp.where(jnp.isfinite(errors), errors, jnp.inf))
@@ -152,7 +152,7 @@ def log_determinant(
     if not is_traced(result) and not float(result.error) <= _DOUBTFUL:
         warn_of_accuracy(
             f"pairs: log det′ = {float(result.value):.4g} has the estimated error {float(result.error):.2g}. Use a "
-            "finer grid, more pairs or coefficients, or name in `extrapolate` the powers of t without a coefficient"
+            "finer grid, more pairs or coefficients, or list in `extrapolate` the powers of t without a coefficient"
         )
     return result
 

@@ -15,8 +15,8 @@ class RegionStatistics:
 
     Attributes:
         labels: (r,) the regions' numbers in ascending order.
-        nodes: (r,) the number of the region's nodes in the domain, which have a value.
-        coverage: (r,) the share of such nodes among all nodes of the region; nodes outside the mask have no value.
+        nodes: (r,) the number of the region's nodes in the domain, where the signature has a value.
+        coverage: (r,) the share of the region's nodes that lie in the domain.
         volume: (r,) the number of nodes times the volume (in 2D, the area) of one node.
         mean: (n_times, r) the unweighted mean over the nodes.
         deviation: (n_times, r) the standard deviation within the region, with the number of nodes as divisor.

@@ -65,7 +65,7 @@ def spectral_flow(
 
     Under "mirror" and "mean" the functions are extended evenly, like the metric.
     """
-    # Inner products over the doubled domain are twice those over the domain for each doubling, or 0 for odd functions.
+    # Each doubling of the domain multiplies inner products of even functions by two; products with odd functions are 0.
     everywhere = pairs.on(on_all_nodes(pairs.pencil))
     parts, known = everywhere.pencil.parts, pairs.space.restrict(functions)
     functionals = len(parts) * parts[0].integrals(pairs.space.transfer(known, everywhere.space))
@@ -81,7 +81,7 @@ def spectral_trace(pairs: Eigenpairs, filters: Filter) -> Float[Array, " m"]:
 @jax.custom_jvp
 def _kernel(contraction: Contraction, filters: Filter, pairs: Eigenpairs) -> Array:
     """Return the contraction of the kernels Φ f(Λ) Φᵀ of m filters."""
-    # In a second derivative JAX differentiates this body instead of the rule, which is not supported.
+    # For second derivatives JAX differentiates this body instead of the rule. Second derivatives are not supported.
     pairs = first_order_only(pairs)
     return _weighted(contraction, _all_weights(filters, pairs.eigenvalues, pairs.kept), pairs.at_nodes)
 
@@ -96,9 +96,9 @@ def _weighted(contraction: Contraction, weights: Float[Array, "m k"], vectors: F
 #
 #     F = [f]∘G − [λf]∘H,    [f]ᵢⱼ = (f(λᵢ) − f(λⱼ))/(λᵢ − λⱼ),  [f]ᵢᵢ = f'(λᵢ),    [λf]ᵢⱼ = f(λᵢ) + λⱼ [f]ᵢⱼ.
 #
-# This does not depend on the basis chosen within a multiple eigenvalue, and is not singular there. Truncation sets f to
-# zero on all pairs that are not kept. Then F is unchanged among the kept pairs, and between a kept i and all other j
-# the entries f(λᵢ) (Gᵢⱼ − λᵢHᵢⱼ)/(λᵢ − λⱼ) add up to
+# F does not depend on the basis chosen for a multiple eigenvalue, and is not singular there. Truncation sets f to zero
+# on all pairs that are not kept. Then F is unchanged among the kept pairs, and between a kept i and all other j the
+# entries f(λᵢ) (Gᵢⱼ − λᵢHᵢⱼ)/(λᵢ − λⱼ) add up to
 #
 #     Σᵢ f(λᵢ) (φᵢxᵢᵀ + xᵢφᵢᵀ),    xᵢ = (I − ΦΦᵀM) dφᵢ,
 #
@@ -139,9 +139,9 @@ def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 
 def _rows_of(pairs: Eigenpairs, number: int) -> tuple[Int[Array, " m"], Bool[Array, " m"]] | None:
-    """Return rows that include the pairs of one part of a doubled domain, and which rows are such pairs.
+    """Return rows that include all pairs of one part of a doubled domain, and whether each row belongs to the part.
 
-    The number of rows is rounded up to one of few sizes. The result is None if there are no parts.
+    The number of rows is rounded up to one of few sizes. The result is None if the domain is not doubled.
     """
     if pairs.part is None:
         return None
@@ -171,13 +171,13 @@ def _tangent(
     change: Pencil,
     reader: Pencil | None,
 ) -> Array:
-    """Return the derivative by the change of one part, given the pairs and the derivative of their frame."""
+    """Return the derivative for the change of one part, given its pairs and the derivative of their frame."""
     values, vectors, kept, d_frame = (x if selection is None else x[selection[0]] for x in (*pairs, d_frame))
     if selection is not None:
-        vectors = jnp.where(selection[1][:, None], vectors, 0)  # pairs of other parts do not mix with these
+        vectors = jnp.where(selection[1][:, None], vectors, 0)  # pairs of different parts do not mix
     if not len(vectors):
         return jnp.zeros_like(contraction.weighted(_all_weights(filters, values, kept), vectors))
-    d_frame = jnp.where(kept[:, None], d_frame, 0)  # it may be NaN where pairs are not kept
+    d_frame = jnp.where(kept[:, None], d_frame, 0)  # d_frame may be NaN where pairs are not kept
     size = even_size(len(vectors), _ROWS)
     starts, place = row_blocks(len(vectors), size)
 

@@ -1,4 +1,4 @@
-"""Checks of eigenpairs and times, default times and energies, and times that suit a metric without its eigenpairs."""
+"""Checks of eigenpairs and times, default times and energies, and times that suit a metric before it has eigenpairs."""
 
 import math
 from typing import Any
@@ -86,9 +86,9 @@ def _n_positive(pairs: Eigenpairs) -> int:
 def default_times(pairs: Eigenpairs, n: int = 16, decay: float = 1e-4) -> Float[Array, " n"]:
     """Return n times, log-spaced from 4 ln10/λ_last to 4 ln10/λ₁ (Sun, Ovsjanikov and Guibas 2009, section 5).
 
-    At the first time the last mode has decayed by the factor 1e-4. At the last, which is not before the first, all
-    modes except the constant have decayed by `decay`. The command line uses 0.085, at
-    which √t is half the length of an interval with the same λ₁.
+    At the first time the last mode has decayed by the factor 1e-4. At the last time, which is not before the first, all
+    modes except the constant have decayed at least by the factor `decay`. The command line uses 0.085: then √t is half
+    the length of an interval with the same λ₁.
 
     Examples:
         >>> times = hj.default_times(pairs, 3)
@@ -141,7 +141,7 @@ def default_k(dimension: int, unknowns: int) -> int:
 def suitable(metric: Any, spacing: Any, inside: Bool[np.ndarray, "*shape"], boundary: BoundarySpec) -> dict[str, float]:
     """Return the times and k that suit a metric on a grid; see `suitable_times`.
 
-    The metric (n, d, d) is given at the nodes inside the domain or at a representative sample of them.
+    The metric (n, d, d) is given at the nodes inside the domain or at a representative sample of these nodes.
     """
     metric, spacing = np.asarray(metric), np.asarray(spacing)
     d, share = len(spacing), inside.sum() / len(metric)
@@ -157,7 +157,7 @@ def suitable(metric: Any, spacing: Any, inside: Bool[np.ndarray, "*shape"], boun
 def suitable_times(
     dimension: int, volume: float, width2: float, size: float, nodes: int, problems: int = 1
 ) -> dict[str, float]:
-    """Return the least times that the spacing and the default k resolve, the k for the former, and the largest time.
+    """Return the least time that the spacing resolves, its k, the least time for the default k, and a largest time.
 
     `width2` is the squared distance between neighbouring nodes, and `size` is the domain's length. Under "mean" and
     "mirror" several problems share the eigenpairs.

@@ -33,12 +33,12 @@ class Truncation(eqx.Module):
 
     Attributes:
         times: (n,).
-        tail: (n,) the share of the heat trace beyond the k pairs, by Weyl's law. It is a mean over the domain; single
-            nodes lack more (`truncation_map`).
+        tail: (n,) the share of the heat trace beyond the k pairs, by Weyl's law. This share is a mean over the domain;
+            single nodes lack more (`truncation_map`).
         resolution_bias: (n,) the relative discretisation error at the median node.
         lasting_bias: (n,) the part of this error that does not decrease with t, due to tensors that turn or stretch.
         coarse_fraction: (n,) the fraction of nodes where the discretisation error exceeds 10 %.
-        smallest_time: the least time at which `tail` is at most 1 %. The worst node then lacks up to 6 %, or up to 20 %
+        smallest_time: the least time at which `tail` is at most 1 %. The worst node then lacks up to 6 %, or 20 %
             beside a Dirichlet side.
         order: the power of 1/t with which the rest of the discretisation error decreases.
     """
@@ -96,17 +96,17 @@ class Truncation(eqx.Module):
 def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]) -> Truncation:
     """Estimate the truncation error of k pairs and the discretisation error of the signature at each time.
 
-    Weyl's law N(λ) = k (λ/Λ)^(d/2), where Λ is the first eigenvalue beyond the k, gives the part of the heat trace
-    beyond Λ. This is a mean over the domain; `truncation_map` estimates the error at each node.
+    Weyl's law N(λ) = k (λ/Λ)^(d/2), where Λ is the first eigenvalue beyond the k pairs, gives the part of the heat
+    trace beyond Λ. This part is a mean over the domain; `truncation_map` estimates the error at each node.
 
-    The discretisation error has two parts of leading order in the spacing h. For a constant metric it is d h²/48t if
-    the metric's axes are the grid's, and more otherwise. The second part does not decrease with t: where tensors turn
-    or stretch between nodes, elements are too stiff and the interpolated tensors have another volume. With enough pairs
-    the median error on such fields was a third to three times the estimate, and a quarter of it for eigenvalue ratios
-    of 30 on coarse grids. On meshes only the first part is estimated.
+    The discretisation error has two parts of leading order in the spacing h. The first part is d h²/48t for a constant
+    metric whose axes are those of the grid, and larger otherwise. The second part does not decrease with t: where
+    tensors turn or stretch between nodes, elements are too stiff and the interpolated tensors have another volume. With
+    enough pairs the measured median error on such fields was 1/3 to 3 times the estimate, and 1/4 of the estimate for
+    eigenvalue ratios of 30 on coarse grids. On meshes only the first part is estimated.
 
-    With a potential or an unknown null space the exponent follows from the mean of the eigenvalues if it exceeds d/2.
-    The discretisation error is then NaN, and also for other matrices.
+    With a potential or an unknown null space, an exponent that follows from the mean of the eigenvalues replaces d/2,
+    if it is larger. The discretisation error is then NaN, as it is for matrices without a node spacing.
 
     Raises:
         ValueError: if times are not positive and finite, pairs lie in an interval, or the dimension is not known.
@@ -139,7 +139,7 @@ def _truncation(
     by_weyl: bool,
     order: int,
 ) -> tuple[Any, ...]:
-    """Return the fields of `Truncation` except the times, for the exponent of Weyl or of the spectrum."""
+    """Return the fields of `Truncation` except the times, by Weyl's exponent d/2 or the spectrum's exponent."""
     # Weyl's law counts from the bottom of the spectrum, which a potential shifts.
     values, next_eigenvalue = values - bottom, next_eigenvalue - bottom
     complete = xp.isinf(next_eigenvalue)
@@ -167,16 +167,16 @@ def _truncation(
     return tail, median_of_shares(xp, bias, free), median_of_shares(xp, lasting, free), coarse, smallest
 
 
-# If all eigenvalues are larger by the factor 1 + δ, the heat trace Z(t) is that of the time (1 + δ)t. This error is
-# proportional to s = −(2/d) d log Z/d log t, which is 1 at small t (Weyl) and 0 where only the constant is left. If the
-# volume is larger by the factor 1 + v, the metric is multiplied by (1 + v)^(2/d). This divides the signature by 1 + v
-# and the eigenvalues by (1 + v)^(2/d), which is an error of v(1 − s). The part beyond too few pairs has s = 1.
+# If all eigenvalues are larger by the factor 1 + δ, the heat trace at t becomes Z((1 + δ)t). This error is proportional
+# to s = −(2/d) d log Z/d log t, which is 1 at small t (Weyl) and 0 where only the constant is left. If the volume is
+# larger by the factor 1 + v, the metric is multiplied by (1 + v)^(2/d). This divides the signature by 1 + v and the
+# eigenvalues by (1 + v)^(2/d), which is an error of v(1 − s). The truncated part of the trace has s = 1.
 def _resolution_bias(
     xp: Any, errors: tuple[Any, Any, Any], free: Any, times: Any, slope: Any, order: int
 ) -> tuple[Any, Any]:
     """Return the estimated relative discretisation error (n, nodes) and its part that does not decrease with t.
 
-    Both are 0 at nodes that are not free.
+    Both numbers are 0 at nodes that are not free.
     """
     dispersion, turning = (xp.where(free, x, 0).ravel() for x in errors[:2])
     lasting = slope[:, None] * turning[None] + (xp.abs(1 - slope) * errors[2])[:, None]
@@ -207,7 +207,7 @@ def _estimated(pairs: Eigenpairs, times: Any) -> tuple[Eigenpairs, Float[Array, 
     """Return pairs and times as constants to derivatives; raise ValueError if the pairs allow no estimate."""
     at = times_of(pairs, times)
     if not pairs.lowest:
-        raise ValueError("pairs: got eigenpairs in an interval; truncation can be estimated only for the lowest")
+        raise ValueError("pairs: got eigenpairs in an interval; truncation can be estimated only for the lowest pairs")
     return jax.lax.stop_gradient((pairs, at))
 
 
@@ -226,9 +226,9 @@ def resolved_times(pairs: Eigenpairs, times: Any) -> Float[Array, " n"]:
 
 
 _EXPONENTS = np.geomspace(0.5, 8, 33)
-"""From ½ for a thin strip, whose lowest eigenfunctions vary along one axis, to 8 for a 3D corner of Dirichlet sides."""
+"""Exponents from ½ (a thin strip, whose lowest modes vary along one axis) to 8 (a 3D corner of Dirichlet sides)."""
 _RESOLVING = scipy.special.gammainccinv(_EXPONENTS, TAIL_LIMIT)
-"""The least Λt at which at most `TAIL_LIMIT` of the heat trace lies beyond Λ, for each of these exponents."""
+"""The least Λt at which at most `TAIL_LIMIT` of the heat trace lies beyond Λ, for each of `_EXPONENTS`."""
 _POINTS, _WEIGHTS = np.polynomial.laguerre.laggauss(24)
 """Gauss–Laguerre quadrature of f(u) e^(−u) from 0 to ∞."""
 
@@ -283,13 +283,13 @@ def truncation_map(
 
     `truncation` estimates the mean over the domain. A single node beside a Dirichlet side, in its corners, or where
     tensors vary between nodes can lack several times as much. Here Weyl's law is local: the function N(λ, x) = Σ φᵢ(x)²
-    over λᵢ < λ is approximated by N(Λ, x) (λ/Λ)^a(x), where Λ is the first eigenvalue beyond the k. The pairs determine
-    N(Λ, x). The mean of λ at the node, which is Λ a/(a + 1), determines the exponent a(x). The exponent is about d/2
-    inside and at Neumann sides, and d/2 + 1 at a Dirichlet side.
+    over λᵢ < λ is approximated by N(Λ, x) (λ/Λ)^a(x), where Λ is the first eigenvalue beyond the k pairs. The pairs
+    determine N(Λ, x). The mean of λ at the node, which is Λ a/(a + 1), determines the exponent a(x). The exponent is
+    about d/2 inside and at Neumann sides, and d/2 + 1 at a Dirichlet side.
 
     The result is an estimate, not a bound. On small grids the largest true share of a node was 0.25 to 2 times the
-    largest estimate if the mean exceeded 0.1 %, and up to 3 times the estimate if the mean was 1e-6. It is NaN outside
-    the mask, and 0 at Dirichlet nodes and if all pairs were computed. Derivatives treat it as a constant.
+    largest estimate if the mean exceeded 0.1 %, and up to 3 times the estimate if the mean was 1e-6. The result is NaN
+    outside the mask, and 0 at Dirichlet nodes or with all pairs. Derivatives treat the result as a constant.
 
     Args:
         times: (n_times,) positive, in (metric length)².

@@ -14,7 +14,7 @@ from hks_jax.linear.chebyshev import coefficient_tails, least_degree
 from hks_jax.spectrum_free.spectrum_bounds import Bounds
 
 _STEEPEST = 0.9
-"""The share of the steepest decay rate of M⁻¹ that the bound uses. Close to 1 the factor of the bound is large."""
+"""The share of the steepest decay rate of M⁻¹ that the bound uses. A share near 1 gives a large factor in the bound."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,10 @@ class Colouring:
         reach: `Bounds.reach` for each axis, times the longest time.
         across: `Bounds.across` for each axis.
         error: an error bound at each time that includes rounding, relative to the smaller of (4πt)^(−d/2) and the
-            largest possible value at a node. For a lumped mass it holds unless `top` is too small, which has the
-            probability 10⁻⁶. For a consistent mass it is proven to first order in the polynomial for M⁻¹, for t → 0 and
-            for a constant metric. Errors for varying metrics were at most a fiftieth of it.
+            largest possible value at a node. For a lumped mass the bound holds unless `top` is too small, which has the
+            probability 10⁻⁶. For a consistent mass the bound is proven to first order in the error of the polynomial
+            for M⁻¹, for t → 0 and for a constant metric. For varying metrics, measured errors were at most a fiftieth
+            of the bound.
     """
 
     spacing: tuple[int, ...]
@@ -70,15 +71,16 @@ class Colouring:
 def reach_bound(distance: Any, reach_time: Any, low: float, across: float) -> Any:
     """Return a bound on √(D_x D_y) times the kernel between nodes at this distance along an axis.
 
-    Davies' method uses the weights exp(αi) along the axis. Then ‖exp(ψ) exp(−tA) exp(−ψ)‖ ≤ exp(t κ (cosh α − 1)),
-    where κ is the reach: only the symmetric part of the weighted K matters, in which couplings across the axis are
-    multiplied by cosh α. So the kernel is at most exp(−αs + tκ (cosh α − 1)), whose minimum is at sinh α = s/tκ. This
-    is the Gaussian kernel exp(−s²/2tκ) for s ≪ tκ and the decay of a random walk for s ≫ tκ.
+    Davies' method uses weights exp(ψ) with ψ = αi at node i along the axis. Let A = D^(−½)KD^(−½), and let κ be the
+    reach. Then ‖exp(ψ) exp(−tA) exp(−ψ)‖ ≤ exp(t κ (cosh α − 1)): only the symmetric part of the weighted K matters, in
+    which couplings across the axis are multiplied by cosh α. So the kernel is at most exp(−αs + tκ (cosh α − 1)), whose
+    minimum is at sinh α = s/tκ. This is the Gaussian kernel exp(−s²/2tκ) for s ≪ tκ and the decay of a random walk for
+    s ≫ tκ.
 
     A consistent mass M has a nonlocal inverse. The symmetric part of the weighted M is M + (cosh α − 1) C, where C has
-    the couplings across the axis and −C ⪯ βM. So it is at least low (1 − β (cosh α − 1)) D, and the inverse is bounded
-    by exp(−αs) divided by that. The product of this and the bound above is a bound for t → 0 and for a constant metric.
-    For varying metrics and other times it is not proven.
+    the couplings across the axis and −C ⪯ βM. So this part is at least low (1 − β (cosh α − 1)) D, and entries of M⁻¹
+    are at most exp(−αs) divided by that factor. The product of both bounds is a bound for t → 0 and for a constant
+    metric. For varying metrics and other times it is not proven.
     """
     s = np.asarray(distance, float)
     alpha = np.arcsinh(s / reach_time)
@@ -101,8 +103,8 @@ def error_bound(spacing: tuple[int, ...], degree: int, time: float, limits: Boun
     """Return a bound on the error at one time, relative to the unit of errors.
 
     The bound is the sum of the expansion's tail and the contributions of the other sources of a colour. A contribution
-    is the kernel at the source's distance. For a lumped mass it is at most the expansion's tail from the degree that
-    equals the distance in nodes, because polynomials of lower degree do not couple the two nodes.
+    is the kernel at the source's distance. For a lumped mass, this kernel is at most the expansion's tail from the
+    degree that equals the distance in nodes, because polynomials of lower degree do not couple the two nodes.
     """
     low, d = limits.low, space.dimension
     tails = coefficient_tails(time * limits.top / 2)
@@ -125,7 +127,7 @@ def error_bound(spacing: tuple[int, ...], degree: int, time: float, limits: Boun
 
 
 def mass_error(mass_degree: int, time: float, limits: Bounds, dimension: int) -> float:
-    """Return a first-order bound in ε = max |1 − μ p(μ)| on the relative error of the approximation P of M⁻¹.
+    """Return a bound, to first order in ε = max |1 − μ p(μ)|, on the relative error due to the approximation P of M⁻¹.
 
     Let w = M^(−½)e_x, S = M^(−½)KM^(−½) and P = M^(−½)(1 − E)M^(−½) with ‖E‖ ≤ ε. Duhamel's formula, with integration
     by parts at small times, bounds the error by 4.5 ε ‖w‖ ‖exp(−St/4)w‖ = 4.5 ε √((M⁻¹)ₓₓ HKS(t/2, x)). Both factors

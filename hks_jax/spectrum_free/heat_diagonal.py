@@ -20,7 +20,7 @@ from hks_jax.fem.sparse_input import pencil_of
 from hks_jax.linear.chebyshev import chebyshev_heat_coefficients
 from hks_jax.linear.dissection import dissect
 from hks_jax.spectrum_free.colours import Colouring
-from hks_jax.spectrum_free.plan import Method, choose_method, plan, require_fewer_vectors, require_grid
+from hks_jax.spectrum_free.plan import Method, choose_method, plan, require_grid
 from hks_jax.spectrum_free.probing import coloured_diagonal
 from hks_jax.spectrum_free.rational import selected_inversion
 from hks_jax.spectrum_free.spectrum_bounds import bounds, mass_bound
@@ -37,16 +37,16 @@ def hks_spectrum_free(
 ) -> Float[Array, "n_times *shape"]:
     """Compute the heat kernel signature without eigenpairs: the diagonal of exp(−tM⁻¹K)M⁻¹.
 
-    The result is that of all eigenpairs of the discretisation, at any t. The cost of colouring grows with t/h², whereas
-    the cost of eigenpairs falls; selected inversion costs the same at any t. docs/spectrum-free.md derives the bounds.
-    The unit is 1/(metric length)^d. Values are NaN outside the mask, 0 at Dirichlet nodes, and all NaN if a given
-    `Colouring` was made for a smaller largest eigenvalue, or for shorter times.
+    The result equals the signature of all eigenpairs of the discretisation, at any t. The cost of colouring grows with
+    t/h², whereas the cost of eigenpairs falls; selected inversion costs the same at any t. docs/spectrum-free.md
+    derives the bounds. The unit is 1/(metric length)^d. Values are NaN outside the mask, 0 at Dirichlet nodes, and all
+    NaN if a given `Colouring` was made for a smaller largest eigenvalue, or for shorter times.
 
     Args:
         domain: a tensor field on a grid, a mesh of triangles or tetrahedra, or a pencil of either from `assemble`.
         times: (n_times,) positive, in (metric length)².
         boundary: see `assemble`; a given pencil already contains it.
-        mass: the same. With colouring, ``"lumped"`` is 50 to 100 times as fast.
+        mass: see `assemble`. With colouring, ``"lumped"`` is 50 to 100 times as fast.
         method: ``"colouring"`` (on grids) applies Chebyshev polynomials to sums of distant point sources, with the same
             vectors for all times. ``"selected-inversion"`` uses a rational approximation with an error of about 1e-10.
             For n nodes each time takes O(n^1.5) operations in 2D, O(n²) in 3D, and memory for complex factors.
@@ -57,9 +57,9 @@ def hks_spectrum_free(
             `Colouring.error` for proofs. Selected inversion does not use it.
 
     Raises:
-        ValueError: if times, tolerance or method are invalid, if the tolerance is below the rounding error (``"auto"``
-            then uses selected inversion if memory suffices), if a time is so large that colouring takes about as many
-            vectors as nodes, if ``"auto"`` takes more than 8 GB on a mesh, or if `jax.jit` lacks a `Colouring`.
+        ValueError: if times, tolerance or method are invalid, if the tolerance is below the rounding error, or a time
+            is so large that colouring takes about as many vectors as nodes (``"auto"`` then uses selected inversion if
+            memory suffices), if ``"auto"`` takes more than 8 GB on a mesh, or if `jax.jit` lacks a `Colouring`.
         TypeError: if colouring is used on a mesh.
 
     Examples:
@@ -109,9 +109,7 @@ def colouring(
     require_number("tolerance", tolerance, 1)
     require_number("memory", memory)
     require_number("slack", slack, above=1, inclusive=True)
-    settings = plan(pencil, times, tolerance, memory, slack)
-    require_fewer_vectors(settings, pencil)
-    return settings
+    return plan(pencil, times, tolerance, memory, slack)
 
 
 def _read_as_unknowns(pencil: AnyPencil) -> AnyPencil:

@@ -29,7 +29,7 @@ _FASTER = 3.0
 _MEMORY = 8e9
 """The memory in bytes above which selected inversion is not chosen automatically."""
 _FILL = {2: 150, 3: 40}
-"""A lower bound, for n large, on the entries of factors over n^(2 − 2/d), the entries of a separator's block, by d."""
+"""Lower bounds, by dimension d, on the number of a factor's entries divided by n^(2 − 2/d), for large n."""
 
 
 def require_grid(pencil: AnyPencil) -> None:
@@ -49,30 +49,26 @@ def choose_method(pencil: AnyPencil, times: Float[Array, " m"], method: Method, 
         )
     if not all(part.bounded for part in pencil.parts):
         raise ValueError(
-            "domain: got a stiffness K with an unknown null space, which may be indefinite; expected K ⪰ 0. Pass the "
-            "null vectors to `sparse_pencil`, or use eigenpairs"
+            "domain: got a stiffness K that may be indefinite, since its null space is unknown; expected K ⪰ 0. Pass "
+            "the null vectors to `sparse_pencil`, or use eigenpairs"
         )
     if method == "selected-inversion" or (method == "auto" and pencil.space.dimension is None):
         return None
     if method == "auto":
-        settings = least_work(pencil, times, tolerance)
-    else:
-        require_grid(pencil)
-        if isinstance(method, Colouring):
-            axes, dimension = len(method.spacing), pencil.space.dimension
-            if axes != dimension:
-                raise ValueError(f"method: got a Colouring for {axes} axes; expected {dimension}, as for the grid")
-            return method
-        settings = plan(pencil, times, tolerance)
-    if settings is not None:
-        require_fewer_vectors(settings, pencil)
-    return settings
+        return least_work(pencil, times, tolerance)
+    require_grid(pencil)
+    if not isinstance(method, Colouring):
+        return plan(pencil, times, tolerance)
+    axes, dimension = len(method.spacing), pencil.space.dimension
+    if axes != dimension:
+        raise ValueError(f"method: got a Colouring for {axes} axes; expected {dimension}, as for the grid")
+    return method
 
 
 def least_work(pencil: AnyPencil, times: Float[Array, " m"], tolerance: float) -> Colouring | None:
     """Return the colouring if it takes less work than selected inversion, or None.
 
-    If selected inversion needs too much memory, a mesh or a tolerance below the rounding error raises `Unattainable`.
+    If selected inversion needs too much memory, a mesh or the errors of `plan` raise `Unattainable`.
     """
     of_inversion = work(None, pencil, times)
     affordable = math.isfinite(of_inversion)
@@ -96,15 +92,16 @@ def least_work(pencil: AnyPencil, times: Float[Array, " m"], tolerance: float) -
 
 
 class Unattainable(ValueError):
-    """The error if no method is possible: the tolerance is below the rounding error, or the mesh exceeds the memory."""
+    """The error if colouring is not possible, or if selected inversion on a mesh would exceed the memory."""
 
 
 def plan(
     pencil: AnyPencil, times: Float[Array, " m"], tolerance: float, memory: float = 2e9, slack: float = 1.0
 ) -> Colouring:
-    """Return a colouring for all parts of a pencil; raise `Unattainable` if the tolerance is below the rounding error.
+    """Return a colouring for all parts of a pencil; traced values raise ValueError.
 
-    Traced values raise ValueError.
+    `Unattainable` is raised if the tolerance is below the rounding error, or if colouring needs about one vector for
+    each node of a large grid.
     """
     pencil, times = jax.lax.stop_gradient((from_lower_bound(pencil)[0], times))
     if is_traced((pencil, times)):
@@ -130,9 +127,18 @@ def plan(
         if not more:
             break
         mass_degree += more  # the upper bound `top` depends slightly on the degree
-    # The value needs five blocks of vectors in memory, its derivatives need eight.
+    # The value needs five blocks of vectors in memory; derivatives need eight.
     columns = int(min(_COLUMNS, max(1, memory // (8 * space.free.size * times.dtype.itemsize))))
-    return choose(concrete, limits, space, tolerance, mass_degree, columns, eps)
+    settings = choose(concrete, limits, space, tolerance, mass_degree, columns, eps)
+    vectors = settings.n_vectors(space)
+    if space.n_dof > _LARGE and 2 * vectors > space.n_dof:
+        other = 'method="selected-inversion", ' if math.isfinite(work(None, pencil, times)) else ""
+        raise Unattainable(
+            f"times: heat spreads so far at the largest time that sources must be {settings.spacing} nodes apart, "
+            f"which takes {vectors} vectors for {space.n_dof} unknowns. Use {other}eigenpairs, smaller times or a "
+            "larger tolerance"
+        )
+    return settings
 
 
 def _widest(limits: Sequence[Bounds], slack: float) -> Bounds:
@@ -152,25 +158,10 @@ def work(settings: Colouring | None, pencil: AnyPencil, times: Float[Array, " m"
         size, d = 2 * times.dtype.itemsize, space.dimension
         if _FILL[d] * float(space.n_dof) ** (2 - 2 / d) * size > _MEMORY:  # dissection is not needed
             return math.inf
-        costs = [inversion_cost(dissect(part.pattern)) for part in pencil.parts]
-        if max(cost.entries for cost in costs) * size > _MEMORY:
+        operations, entries = zip(*(inversion_cost(dissect(part.pattern)) for part in pencil.parts), strict=True)
+        if max(entries) * size > _MEMORY:
             return math.inf
-        return times.size * pole_pairs(times.dtype) * sum(cost.operations for cost in costs) / _FASTER
+        return times.size * pole_pairs(times.dtype) * sum(operations) / _FASTER
     assert isinstance(space, GridSpace)
     products = (settings.degree + 1) * settings.mass_degree
     return 2.0 * len(pencil.parts) * settings.n_vectors(space) * products * 3**space.dimension * space.free.size
-
-
-def require_fewer_vectors(settings: Colouring, pencil: AnyPencil) -> None:
-    """Raise ValueError if colouring needs about one vector for each node of a large grid."""
-    space = pencil.space
-    assert isinstance(space, GridSpace)
-    vectors = settings.n_vectors(space)
-    if space.n_dof > _LARGE and 2 * vectors > space.n_dof:
-        affordable = math.isfinite(work(None, pencil, jnp.ones(1, pencil.parts[0].stiffness.dtype)))
-        other = 'method="selected-inversion", ' if affordable else ""
-        raise ValueError(
-            f"times: heat spreads so far at the largest time that sources must be {settings.spacing} nodes apart, "
-            f"which takes {vectors} vectors for {space.n_dof} unknowns. Use {other}eigenpairs, smaller times or a "
-            "larger tolerance"
-        )

@@ -23,7 +23,7 @@ T = TypeVar("T")
 def coloured_diagonal(
     settings: Colouring, colours: StaticArray, pencil: NodalPencil, coefficients: Float[Array, "m terms"]
 ) -> Float[Array, "m *shape"]:
-    """Return Σₙ cₙ Tₙ(2A/top − 1) P with A = PK at the sources, for every row of coefficients.
+    """Return the diagonal of Σₙ cₙ Tₙ(2A/top − 1) P at the sources, where A = PK, for every row of coefficients.
 
     The colours (*shape) are 0, 1, …, or −1 for no colour, where the result is 0. The vector of a colour is 1 at its
     nodes.

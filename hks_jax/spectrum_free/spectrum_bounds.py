@@ -1,4 +1,4 @@
-"""Bounds on the spectra for the polynomials and on the speed of heat along an axis."""
+"""Bounds on spectra, for Chebyshev polynomials, and on the speed of heat along an axis."""
 
 from dataclasses import replace
 from functools import partial
@@ -21,8 +21,8 @@ _STEPS, _MASS_STEPS = 50, 200
 class Bounds(NamedTuple):
     """Bounds for the polynomials of a pencil; for concrete values, NumPy numbers in double precision.
 
-    For each axis, reach bounds the eigenvalues of D⁻¹ times the couplings of K across the axis; it is the discrete
-    counterpart of 2 gᵃᵃ/h². And across is the least β such that the couplings C of M across the axis satisfy −C ⪯ βM;
+    For each axis, ``reach`` bounds the eigenvalues of D⁻¹ times the couplings of K across the axis; it is the discrete
+    counterpart of 2 gᵃᵃ/h². ``across`` is the least β such that the couplings C of M across the axis satisfy −C ⪯ βM;
     it is 1 for a constant metric, and 0 if the mass is lumped.
     """
 

@@ -11,6 +11,7 @@ import scipy
 from jaxtyping import Array, Float
 
 from hks_jax.checks import real_array, require_number
+from hks_jax.domain import spd
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_checks import tensors_on
 from hks_jax.traced import is_traced
@@ -38,8 +39,7 @@ class TensorNoise(eqx.Module):
         freedom: the degrees of freedom of the covariance if it was estimated; infinite if it was given.
 
     Raises:
-        ValueError: The covariance is not positive semidefinite, or has another shape; the correlation is positive and
-            there is no grid.
+        ValueError: The covariance is not positive semidefinite, or has another shape; a correlation has no grid.
 
     Examples:
         >>> noise = hj.TensorNoise(np.tile(np.eye(3), (9, 9, 1, 1)))
@@ -63,7 +63,7 @@ class TensorNoise(eqx.Module):
                 "and 6 for tensors in 3D (xx xy yy xz yz zz)"
             )
         if grid is not None and shape[:-2] != grid.shape:
-            raise ValueError(f"covariance: got shape {shape}; expected {(*grid.shape, *shape[-2:])}, as the grid")
+            raise ValueError(f"covariance: got shape {shape}; expected {(*grid.shape, *shape[-2:])} for this grid")
         if self.correlation and grid is None:
             raise ValueError("correlation: got a length but no grid; expected both. Pass the grid of the tensors")
         if not is_traced(self.covariance):
@@ -120,7 +120,7 @@ class TensorNoise(eqx.Module):
         from all nodes inside the mask. A median gives the size of the covariance; the correlation of neighbours along
         the axes gives the length. The scans must be aligned, and their noise must be independent and have the same
         covariance. The estimate of the noise includes the effect of motion between the scans.
-        The mean of both scans has half the covariance.
+        The mean of both scans has half this covariance.
 
         Args:
             first: (*shape, d, d), the tensors of the first scan.
@@ -140,7 +140,7 @@ class TensorNoise(eqx.Module):
         relative = np.einsum("na,nb->ab", parts[inside], parts[inside]) / (2 * inside.sum())
         if not np.trace(relative) > 0:
             raise ValueError("first, second: got equal tensors; expected different noise. Pass a second scan")
-        # The median of q is scaled to that of χ², because a few nodes, as in fluid, have much more noise than most.
+        # The median of q is scaled to the median of χ², because a few nodes, as in fluid, have much more noise.
         q = np.einsum("na,ab,nb->n", parts[inside], np.linalg.pinv(2 * relative), parts[inside])
         relative *= np.median(q) / (2 * scipy.special.gammaincinv(len(relative) / 2, 0.5))
         # Smoothed white noise has the correlation exp(−h²/4w²) at the distance h.
@@ -157,9 +157,9 @@ class TensorNoise(eqx.Module):
         """Estimate the level of noise from second differences of the tensors.
 
         In a smooth field, the tensor at a node minus the mean of its two neighbours along an axis is noise, with √1.5
-        times the standard deviation of the noise of one node. A median over all nodes and axes is robust against few
-        edges. The noise must be independent between nodes. The estimate is too small after smoothing or
-        interpolation, and too large in fine anatomy.
+        times the standard deviation of the noise of one node. A median over all nodes and axes is robust against a few
+        edges. The noise must be independent between nodes. The estimate is too small after smoothing or interpolation,
+        and too large in fine anatomy.
 
         Args:
             tensors: (*shape, d, d), the measured tensors.
@@ -203,7 +203,7 @@ class TensorNoise(eqx.Module):
             kernels = [jnp.asarray(each, white.dtype) for each in gaussians(self.grid, self.correlation)]
             white = along_axes(kernels, white)
         if self.modes is None:
-            root = _root(jnp.asarray(self.covariance)).astype(white.dtype)
+            root = spd.cholesky(jnp.asarray(self.covariance)).astype(white.dtype)
             parts = jnp.einsum("...ab,...b->...a", root, white, precision="highest")
         else:
             parts = jnp.einsum("...na,n->...a", self.modes.astype(white.dtype), white, precision="highest")
@@ -214,18 +214,6 @@ class TensorNoise(eqx.Module):
 
 def _squared_mean(tensors: Any) -> Float[Array, "*shape 1 1"]:
     return jnp.square(jnp.trace(jnp.asarray(tensors), axis1=-2, axis2=-1) / np.shape(tensors)[-1])[..., None, None]
-
-
-def _root(covariance: Float[Array, "*shape m m"]) -> Float[Array, "*shape m m"]:
-    """Return the Cholesky factor. If a pivot is zero, as for a singular covariance, its column is zero."""
-    factor = jnp.zeros_like(covariance)
-    least = 1e-12 * jnp.max(jnp.diagonal(covariance, axis1=-2, axis2=-1), axis=-1)
-    for j in range(covariance.shape[-1]):
-        column = covariance[..., j] - jnp.sum(factor * factor[..., j, None, :], axis=-1)
-        positive = (column[..., j] > least)[..., None]
-        column = column / jnp.sqrt(jnp.where(positive, column[..., j, None], 1))
-        factor = factor.at[..., j:, j].set(jnp.where(positive, column, 0)[..., j:])
-    return factor
 
 
 def _check_semidefinite(covariance: Float[np.ndarray, "*shape m m"]) -> None:

@@ -3,7 +3,6 @@
 import math
 import os
 from collections.abc import Callable
-from functools import partial
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -41,7 +40,7 @@ _LOUD = 3.0
 
 
 class _Moments(eqx.Module):
-    """The sum of the squared linear parts over balanced samples, and the mean and squared deviations of even parts."""
+    """Over balanced samples, the sum of squared linear parts, and the mean and squared deviations of even parts."""
 
     n: Array
     odd: Any
@@ -62,8 +61,9 @@ class _Moments(eqx.Module):
 # Let η₁, η₂, η₃ be independent noise with the covariance Σ. The four sums δ = (±η₁ ± η₂ ± η₃)/√3 are the corners of a
 # tetrahedron; each δ has the covariance Σ. Let y be the four maps at D + sδ. The δ add up to zero, so the mean of y
 # minus the value is of second order, and its expectation is s² times the bias. Up to second order, we have
-# y₁ + y₂ − y₃ − y₄ = 4sJη₁/√3; similar formulas give Jη₂ and Jη₃. Four maps thus give three samples, and two antithetic
-# pairs give two. The second-order variance is that of a quadratic form of one δ; the mean of four has a third of it.
+# y₁ + y₂ − y₃ − y₄ = 4sJη₁/√3; similar formulas give Jη₂ and Jη₃. Four maps thus give three samples, whereas two
+# antithetic pairs give only two. The second-order variance is that of a quadratic form of one δ; the mean of four has a
+# third.
 @jax.jit
 def _parts(maps: list[Any], value: Any) -> tuple[Any, Any]:
     """Return the samples Jη (3, …) of the noise of the value, and the even part, whose expectation is the bias."""
@@ -101,29 +101,30 @@ def uncertainty(
         bars = hj.uncertainty(signature, D, hj.TensorNoise.relative(D, 0.1))
         bars.deviation, bars.bias, bars.interval(0.95), bars.z(1.0), bars.summary()
 
-    Four samples δ of the noise with sum zero are drawn at a time, and maps of D + δ/2 are computed. Their differences
-    give three samples of the error of the value, and their mean gives the bias. The noise is halved, because the
-    measured tensors already contain noise. The relative error of a deviation is 29 % with 8 draws, and 8 % with 100.
+    Four samples δ of the noise with sum zero are drawn at a time, and maps of D + δ/2 are computed. The differences of
+    the maps give three samples of the error of the value, and the mean of the maps gives the bias. The noise is halved,
+    because the measured tensors already contain noise. With 8 draws a deviation has the relative error 29 %, with 100 8
+    %.
 
     Args:
-        function: maps tensors (*shape, d, d) to an array, or to a pytree of arrays. JAX must be able to trace it,
-            unless `compiled` is false. Times and energies should be fixed, and not depend on the eigenpairs.
+        function: maps tensors (*shape, d, d) to an array, or to a pytree of arrays. JAX must be able to trace the
+            function, unless `compiled` is false. Times and energies should be fixed, and not depend on the eigenpairs.
         tensors: (*shape, d, d), the measured tensors at nodes or cells; positive definite at nodes with noise.
         noise: the noise of the tensors (see `TensorNoise`).
         method: ``"resample"`` computes maps of noisy tensors. ``"exact"`` computes the variance gᵀΣg of each number of
-            the result by one reverse-mode product. ``"linear"`` computes `draws` products with one linearisation. The
-            last two also compute eight maps, for the bias and the second-order variance. ``"auto"`` chooses
-            ``"exact"`` if the result has at most `draws` numbers, or else ``"resample"``, because a product with the
-            Jacobian of a signature takes as long as one or two signatures.
+            the result by one reverse-mode product. ``"linear"`` computes `draws` products with one linearisation. Both
+            ``"exact"`` and ``"linear"`` also compute eight maps, for the bias and the second-order variance. ``"auto"``
+            chooses ``"exact"`` if the result has at most `draws` numbers, or else ``"resample"``, because a product
+            with the Jacobian of a signature takes as long as one or two signatures.
         draws: the number of noisy maps (products for ``"linear"``), at least 8; rounded up to a multiple of four.
         smoothing: the standard deviation, in coordinate units, of a Gaussian that smooths the tensors before the
             function is evaluated (see `smooth_tensors`); the noise must have a grid. 0 for no smoothing.
         seed: the seed of the random numbers.
-        compiled: whether to compile the function once for all draws. False calls it directly, without tracing.
+        compiled: whether to compile the function once for all draws. Otherwise the function is called directly.
         progress: a function that is called with a short text after every four maps.
-        checkpoint: a file that is written after every four maps. If it exists, resampling continues from its state.
+        checkpoint: a file that is written after every four maps. If the file exists, resampling continues.
         each: a function that is called with each sample of the noise of the value, three times for four maps, for
-            example to compute covariances or errors of means. It is not called for the samples of a checkpoint.
+            example to compute covariances or errors of means. It is not called for samples of a checkpoint.
 
     Returns:
         The value with its standard deviation, its bias and their accuracy. Under `jit`, `method` must not be
@@ -134,7 +135,7 @@ def uncertainty(
             belongs to another computation.
 
     Warns:
-        AccuracyWarning: No intervals are claimed, because noise makes tensors indefinite or acts beyond linear.
+        AccuracyWarning: if no intervals are claimed, because noise makes tensors indefinite or acts nonlinearly.
 
     Examples:
         >>> noise = hj.TensorNoise.relative(field.tensors, 0.1)
@@ -155,7 +156,7 @@ def uncertainty(
         value = run(measured)
     except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
         raise ValueError(
-            "function: got one that JAX cannot trace, because it depends on concrete values; expected a traceable one. "
+            "function: got a function of concrete values, which JAX cannot trace; expected a traceable function. "
             'Pass compiled=False, or avoid choices by values such as hks(…, method="auto")'
         ) from error
     if method == "auto":
@@ -168,14 +169,12 @@ def uncertainty(
     variance = jax.tree.map(lambda odd: odd / samples, moments.odd)
     spread = jax.tree.map(lambda s: s / (samples - 1), moments.spread)
     freedom: float = samples * (_BALANCED - 1)
-    if method != "resample":
-        freedom = math.inf if method == "exact" else draws
-        rule = _exact if method == "exact" else partial(_linear, draws=draws)
-        variance = rule(whole, measured, noise, seed)
+    if method == "exact":
+        freedom, variance = math.inf, _exact(whole, measured, noise)
+    elif method == "linear":
+        freedom, variance = draws, _linear(whole, measured, noise, seed, draws)
     freedom = 1 / (1 / freedom + 1 / noise.freedom) if min(freedom, noise.freedom) < math.inf else math.inf
-    smear = None
-    if smoothing:
-        smear = jax.tree.map(jnp.subtract, run(smoothed(measured)), value)
+    smear = jax.tree.map(jnp.subtract, run(smoothed(measured)), value) if smoothing else None
     result = Uncertainty(
         value,
         jax.tree.map(jnp.sqrt, variance),
@@ -222,18 +221,18 @@ def _check(measured: Array, noise: TensorNoise, method: str, draws: int, smoothi
     level = float(np.median(np.sqrt(variance[noisy]) / mean[noisy]))
     if not 1e-6 < level < _LOUD:
         raise ValueError(
-            f"noise: got a standard deviation of {level:.3g} of the mean diffusivity (median over the nodes); expected "
-            f"1e-6 to {_LOUD:g}. Give the covariance in the squared unit of the tensors, and diffusivities, not metrics"
+            f"noise: got a standard deviation of {level:.3g} times the mean diffusivity (median over the nodes); "
+            f"expected 1e-6 to {_LOUD:g}. Pass diffusivities, not metrics, and a covariance in their squared unit"
         )
 
 
 def _positive(measured: Array, noisy: Array) -> tuple[Array, Array]:
-    """Raise small eigenvalues of indefinite noisy tensors; return all tensors, and the share of indefinite ones.
+    """Raise small eigenvalues of indefinite noisy tensors; return all tensors, and the share that was indefinite.
 
     Nodes whose tensor is not positive definite without noise, as outside a mask, are ignored.
     """
-    valid = jnp.isfinite(spd.positive_or_nan(measured)).all(axis=(-2, -1))
-    bad = valid & ~jnp.isfinite(spd.positive_or_nan(noisy)).all(axis=(-2, -1))
+    valid = spd.is_positive(measured)
+    bad = valid & ~spd.is_positive(noisy)
 
     def raised(noisy: Array) -> Array:
         values, vectors = spd.eigh(noisy)
@@ -253,7 +252,7 @@ def _white(noise: TensorNoise, seed: Any, index: Any, dtype: Any) -> Array:
 
 @jax.jit
 def _four(measured: Array, noise: TensorNoise, seed: Any, index: Any) -> tuple[list[Array], Array]:
-    """Return four noisy tensor fields with noise of sum zero, and the sum of the indefinite shares with full noise."""
+    """Return four tensor fields with halved noise of sum zero, and the sum of the indefinite shares for full noise."""
     each = jnp.stack([noise.tensors(_white(noise, seed, 3 * index + i, measured.dtype)) for i in range(3)])
     changes = jnp.tensordot(
         jnp.asarray(_SIGNS / math.sqrt(3), each.dtype), each, 1, precision=jax.lax.Precision.HIGHEST
@@ -311,14 +310,14 @@ def _sampled(
     return moments
 
 
-def _exact(function: Callable[[Array], Any], D: Array, noise: TensorNoise, seed: int) -> Any:
+def _exact(function: Callable[[Array], Any], D: Array, noise: TensorNoise) -> Any:
     """Return the variance gᵀΣg of every number of the result by a reverse-mode product for each."""
 
     @jax.jit
     def squares(D: Array, noise: TensorNoise) -> Any:
         value, pull = jax.vjp(function, D)
         flat, unravel = ravel_pytree(value)
-        back = jax.linear_transpose(noise.tensors, _white(noise, seed, 0, D.dtype))
+        back = jax.linear_transpose(noise.tensors, jax.ShapeDtypeStruct(noise.white_shape, D.dtype))
         ones = jnp.eye(flat.size, dtype=flat.dtype)
         return unravel(jax.lax.map(lambda one: jnp.sum(back(*pull(unravel(one)))[0] ** 2), ones))
 

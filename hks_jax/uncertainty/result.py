@@ -64,8 +64,8 @@ class Uncertainty(eqx.Module):
     def interval(self, level: float = 0.95) -> tuple[Any, Any]:
         """Return the lower and the upper ends of intervals that contain the true value with probability `level`.
 
-        The centre of an interval is the corrected value. Its width follows Student's distribution, which takes account
-        of the number of draws. The errors must be normally distributed (see `trusted`).
+        The centre of an interval is the corrected value. The width of an interval follows Student's distribution, which
+        takes account of the number of draws. The errors must be normally distributed (see `trusted`).
         """
         require_number("level", level, 1)
         quantile = float(scipy.special.stdtrit(min(self.freedom, 1e6), 0.5 + level / 2))
@@ -88,7 +88,7 @@ class Uncertainty(eqx.Module):
             maps = (len(deviation) if deviation.ndim > 1 else deviation.size, -1)
             share = jnp.abs(bias / jnp.where(deviation > 0, deviation, jnp.nan)).reshape(maps)
             second = jnp.where(deviation > 0, beyond, jnp.nan).reshape(maps)
-            # The median of an estimate from few draws is below its mean. The limit is scaled by their ratio.
+            # The median of an estimate from few draws is below its mean. The ratio of median and mean scales the limit.
             limit = BEYOND * float(scipy.special.fdtri(self.samples, min(self.freedom, 1e6), 0.5))
             small = (jnp.nanmedian(second, axis=1) <= limit) & (jnp.nanmedian(share, axis=1) <= 1)
             return (small & (self.indefinite <= INDEFINITE)).reshape(deviation.shape[:1])
@@ -107,7 +107,7 @@ class Uncertainty(eqx.Module):
         """Return `signal_to_noise` over the given nodes, for example nodes with little influence of the boundary.
 
         Args:
-            nodes: bool array that broadcasts to the shape of the value. The ratio is NaN if it contains no node.
+            nodes: bool array that broadcasts to the shape of the value. The ratio is NaN if no node is true.
         """
 
         def of(value: Array, deviation: Array) -> Array:

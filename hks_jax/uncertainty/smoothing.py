@@ -37,7 +37,7 @@ def smooth_tensors(grid: Grid, tensors: Any, width: float) -> Float[Array, "*sha
     require_number("width", width, inclusive=True)
     if width == 0:
         return values
-    with jax.ensure_compile_time_eval():  # XLA takes long to fold these constants
+    with jax.ensure_compile_time_eval():  # XLA takes a long time to fold these constants
         weights = [jnp.asarray(each, values.dtype) for each in gaussians(grid, width)]
         inside = jnp.asarray(grid.inside, values.dtype)[..., None, None]
         total = jnp.where(inside > 0, along_axes(weights, inside), 1)

@@ -14,8 +14,8 @@ from hks_jax.cli import main
 from hks_jax.cli.options import as_options
 from hks_jax.cli.outputs import write_outputs
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import image_suffix
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
+from hks_jax.io.formats import format_of
 from hks_jax.io.result import Result
 
 SHAPE = (14, 12, 5)
@@ -387,7 +387,7 @@ def test_volumes_without_an_element_and_of_eight_values(tmp_path, capsys):
 def test_signatures_come_in_the_format_of_the_tensors(tensors, tmp_path, library, suffix):
     pytest.importorskip(library)
     volume = read_tensors(tensors)
-    assert image_suffix(tmp_path / f"t{suffix}") == suffix
+    assert format_of(tmp_path / f"t{suffix}").image == suffix
     report = {"settings": {"k": 3, "metric": "inverse"}}
     volume = replace(volume, tensors=volume.tensors.astype(np.float32))
     result = Result(volume, np.ones((2, *SHAPE)), np.array([1.0, 2.0]), np.arange(3.0), report)

@@ -66,7 +66,7 @@ def test_what_other_programs_write(tmp_path, name, text):
         (
             "m.off",
             f"OFF\n4 4 6\n{POINTS}{FACES}".replace("0 0 1\n", "0 0\n"),
-            r"\[2, 3\] columns; expected 3",
+            r"\[2, 3\] columns; expected equal numbers",
         ),
         ("m.off", f"4OFF\n4 4 6\n{POINTS}{FACES}", "does not begin with OFF"),
         ("m.off", "", "does not begin with OFF"),

@@ -102,7 +102,7 @@ def test_a_unit_that_nifti_does_not_have_is_refused(tmp_path):
     image = nib.load(write(tmp_path / "t.nii", "mm", 2.0))
     image.header["xyzt_units"] = 5
     nib.save(image, tmp_path / "t2.nii")
-    with pytest.raises(ValueError, match=r"t2\.nii: got the code 5 for the unit of space"):
+    with pytest.raises(ValueError, match=r"t2\.nii: got the code 5 for the unit of length"):
         read_tensors(tmp_path / "t2.nii")
 
 

@@ -136,7 +136,7 @@ def test_damaged_images_of_mrtrix(tmp_path):
         (whole.replace(b"Float32BE", b"CFloat32BE"), "expected real numbers"),
         (whole.replace(b"-0,+1,-2,+3", b"-0,+1,-2,+2"), "layout: got"),
         (whole.replace(b"dim: 4,3,2,6", b"dim: 4,3,9,6"), "bytes; expected"),
-        (whole.replace(b"file: . 324", b"file: x 324"), "expected voxels in the file itself"),
+        (whole.replace(b"file: . 324", b"file: x 324"), "for voxels in the same file"),
         (whole[7:], "does not begin with"),
     ):
         (tmp_path / "t.mif").write_bytes(content)

@@ -124,7 +124,7 @@ def test_image_errors():
         scalar_image(ax, np.zeros((3, 3, 3)), Grid((3, 3, 3)))
     with unchecked(), pytest.raises(ValueError, match=r"values: got shape \(6, 5\)"):
         hks_panels(np.zeros((6, 5)), [1.0], grid)
-    with pytest.raises(ValueError, match=r"titles: got 1; expected 2"):
+    with pytest.raises(ValueError, match=r"titles: got 1 titles; expected 2"):
         hks_panels(np.zeros((2, 6, 5)), [1.0, 2.0], grid, titles=["one"])
 
 

@@ -86,7 +86,7 @@ def test_what_is_compiled_for_one_mask_serves_another(rng, solver):
         with compilations() as seen:
             run(third, gradient)
         # Only the numbers of unknowns differ: rows go from the nodes that a mask has to all nodes, and back.
-        moves = {"jit(_taken)", "jit(_spread_by_jax)", "jit(broadcast_in_dim)"} if gradient else set()
+        moves = {"jit(taken)", "jit(_spread)", "jit(broadcast_in_dim)"} if gradient else set()
         assert set(seen) <= moves | {"jit(stage)"}
 
 

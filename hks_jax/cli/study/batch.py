@@ -63,7 +63,7 @@ KEPT = f"""
     Automatic times are log-spaced over the range that suits all subjects, and the study keeps them
 """
 DEFAULTS = {option.name: None for option in options_in(KEPT) if option.name not in FILES}
-"""The options that a study keeps, without a default, so that omitted options are known."""
+"""The options that a study keeps, with the default None, by which omitted options are recognised."""
 OPTIONS = f"""
 subjects SUBJECTS  the table of subjects
 -o,--output DIR!  the study's folder
@@ -124,7 +124,7 @@ def _is_there(study: Study, subject: Subject) -> bool:
 
 
 def _other_units(study: Study, done: list[Subject]) -> dict[str, str]:
-    """Return error messages for subjects whose diffusivities differ too much from the others' to have the same unit."""
+    """Return error messages for subjects whose diffusivity suggests another unit than for the other subjects."""
     if study.settings.metric == "tensor":  # the tensors need not describe diffusion
         return {}
     inputs = {subject.name: read_json(study.path(subject, f"{MAP}.json")).get("Input", {}) for subject in done}
@@ -140,7 +140,7 @@ def _other_units(study: Study, done: list[Subject]) -> dict[str, str]:
 
 
 def _complete(args: argparse.Namespace) -> str:
-    """Replace omitted options by those of the study in the folder, or else by defaults; return a note about them."""
+    """Replace omitted options by options of the study in the folder or by defaults; return a note about them."""
     before = {} if args.replace else read_json(args.output / "study.json")
     kept, taken = _options(before), []
     # Comparable subjects need the same boundary condition, with or without a mask.
@@ -156,7 +156,7 @@ def _complete(args: argparse.Namespace) -> str:
 
 
 def _options(record: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options in a study's record by their names in Python, with tuples in place of lists."""
+    """Return the options in the record of a study, with names as in Python and tuples in place of lists."""
     if not record:
         return {}
     times = record["times"] if record["chosen"] == "explicit" else record["chosen"]
@@ -173,7 +173,7 @@ def _spelled(name: str, value: Any) -> str:
 
 
 def _open(args: argparse.Namespace, subjects: list[Subject], progress: StudyProgress) -> Study:
-    """Return the study with explicit times and write its description; raise ValueError for another study's folder."""
+    """Return the study with explicit times and write its description; raise ValueError if the folder has another."""
     study = Study(args.output, Settings.of(args), args.time_unit, reading_options(args), args.save_pairs)
     times = study.settings.times
     before, chosen = read_json(args.output / "study.json"), "explicit" if times.explicit else f"auto:{times.automatic}"
@@ -217,7 +217,7 @@ def _suitable(
 
 
 Range = tuple[float, float]
-"""The least and the largest time that suit a subject: voxels and eigenpairs limit the first, the size the second."""
+"""The least time that suits a subject, which voxels and eigenpairs limit, and the largest, which the size limits."""
 
 
 def suitable_range(volume: TensorVolume, args: argparse.Namespace) -> Range:

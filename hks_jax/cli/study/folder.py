@@ -15,9 +15,9 @@ from hks_jax import __version__
 from hks_jax.cli.job import Settings
 from hks_jax.cli.noise import second_scan
 from hks_jax.cli.options import COLUMNS
-from hks_jax.cli.reading import image_suffix
 from hks_jax.cli.study.subjects import Subject
 from hks_jax.cli.values import Times
+from hks_jax.io.formats import format_of
 from hks_jax.io.masks import names_beside
 from hks_jax.io.nifti import is_nifti, siblings, sidecar_of
 from hks_jax.io.result import Result, plain
@@ -95,12 +95,12 @@ class Study:
     def write_signature(
         self, subject: Subject, fingerprint: str, result: Result, warnings: list[str], draw: Callable[[Path], Any]
     ) -> None:
-        """Write a subject's signature, its picture and, last, the sidecar that marks completion; no file has a date."""
+        """Write a subject's signature, its picture and, last, the sidecar that marks completion, all without dates."""
         self.forget(subject)
         args, report, scaled = subject.args, result.report, result.arrays.get("scaled_times")
         target = self.path(subject, MAP)
         with atomic_folder(target.parent) as temporary:
-            result.save(temporary / target.name, image_suffix(args.file))
+            result.save(temporary / target.name, format_of(args.file).image)
         with atomic_path(self.path(subject, f"{MAP}.png", "figures")) as picture:
             draw(picture)
         sidecar = {
@@ -164,12 +164,12 @@ class Study:
         about = {**self.record, "chosen": chosen, "description": times_text(self.time_unit)}
         write_json(self.folder / "study.json", about)
         covariates = list(dict.fromkeys(name for subject in subjects for name in subject.covariates))
-        first = {subject.participant: subject.covariates for subject in reversed(subjects)}  # first session
+        first = {subject.participant: subject.covariates for subject in reversed(subjects)}  # of the first session
         rows = [(who, *map(first[who].get, covariates)) for who in dict.fromkeys(s.participant for s in subjects)]
         write_table(self.folder / "participants.tsv", ("participant_id", *covariates), rows)
 
     def write_group(self, subjects: list[Subject], problems: Mapping[str, str], with_regions: bool) -> list[Path]:
-        """Write the tables of all subjects and all regions; `problems` maps names to reasons why subjects failed."""
+        """Write the tables of all subjects and all regions; `problems` maps names of failed subjects to reasons."""
         n = 1 + any(subject.session for subject in subjects)
         head, ids = ("participant_id", "session_id")[:n], {s.name: (s.participant, s.session)[:n] for s in subjects}
         summary = [(*ids[s.name], *_summary(self.path(s, f"{MAP}.json"), problems.get(s.name))) for s in subjects]
@@ -187,7 +187,7 @@ class Study:
 
 
 def reading_options(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the options for reading and noise by name. "file" replaces the path of a second scan, which may change."""
+    """Return the options for reading and noise, with "file" in place of the path of a second scan, which may change."""
     names = [option for option in COLUMNS if args.noise is not None or option not in ("noise", "draws")]
     reading = {option: getattr(args, option.replace("-", "_")) for option in names}
     return reading if second_scan(args) is None else {**reading, "noise": "file"}

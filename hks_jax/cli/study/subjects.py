@@ -20,7 +20,7 @@ class Subject:
     Attributes:
         participant: ``sub-`` and a label.
         session: ``ses-`` and a label, or the empty text.
-        arguments: the arguments of the command, updated by those of the row; None if the latter are invalid.
+        arguments: the arguments of the command, some replaced by values in the row; None if the row is invalid.
         problem: the error message if the arguments are invalid; otherwise empty.
         covariates: the columns that are not arguments.
     """
@@ -55,7 +55,7 @@ class _RowParser(argparse.ArgumentParser):
 
 
 def read_subjects(path: Path, common: argparse.Namespace) -> list[Subject]:
-    """Read the table, and update the arguments for all subjects by those of each row.
+    """Read the table; for each subject, replace arguments of the command by values in the row.
 
     A row with invalid options becomes a subject with a problem. The function raises ValueError for a missing
     `participant_id`, for a label that BIDS does not allow, and for a duplicate subject and session.

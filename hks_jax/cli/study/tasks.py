@@ -17,18 +17,19 @@ from hks_jax.cli.job import ComputationError, Solved, compute_pairs
 from hks_jax.cli.noise import signature_of
 from hks_jax.cli.pairs import are_of, read_pairs, write_pairs
 from hks_jax.cli.progress import StudyProgress
-from hks_jax.cli.reading import image_suffix, read_volume
+from hks_jax.cli.reading import read_volume
 from hks_jax.cli.stats import region_table
 from hks_jax.cli.study.folder import MAP, PAIRS, REGIONS, Study
 from hks_jax.cli.study.subjects import Subject
 from hks_jax.cli.values import Times
+from hks_jax.io.formats import format_of
 from hks_jax.io.tables import write_table
 from hks_jax.plot import signature_panels
 from hks_jax.signatures.times import positive_range
 from hks_jax.storage import claim
 
 FORGETFUL = 8
-"""The number of subjects after which compiled programs are deleted; each domain needs its own 70 MiB of programs."""
+"""The number of subjects after which compiled programs are deleted; each domain needs 70 MiB of new programs."""
 
 PATIENCE = 0.5
 """The seconds between two checks of subjects that other processes compute."""
@@ -56,7 +57,7 @@ def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debu
         except Exception as error:
             failed(subject, error)
     pending = [task for task in plan if task.signature or task.regions]
-    # A subject that ended an earlier process, perhaps by lack of memory, may do so again, so it comes last.
+    # If a subject ended an earlier process, perhaps by lack of memory, it may do so again, so it comes last.
     pending.sort(key=lambda task: task.attempt.exists())
     if len(pending) < len(plan):
         progress.end(f"{len(plan) - len(pending)} of {len(subjects)} subjects are already done")
@@ -100,7 +101,7 @@ class _Task(NamedTuple):
 
     @classmethod
     def of(cls, study: Study, subject: Subject) -> "_Task":
-        """Return a task with the parts that are missing or have another fingerprint."""
+        """Return the task for a subject, with the parts whose files are missing or have another fingerprint."""
         fingerprint = study.fingerprint(subject)
         regions = "" if subject.args.atlas is None else study.regions_fingerprint(subject, fingerprint)
         task = cls(study, subject, fingerprint, True, regions)
@@ -112,7 +113,7 @@ class _Task(NamedTuple):
         return self.study.folder / self.subject.folder / ".attempt"
 
     def left(self) -> "_Task | None":
-        """Return the parts that are still missing, because another process may have done some, or None."""
+        """Return the parts that are still missing, or None if other processes have done them."""
         missing = self.signature and not self.study.has(self.subject, MAP, self.fingerprint)
         known = not missing and self.study.has(self.subject, REGIONS, self.regions)
         left = self._replace(signature=missing, regions="" if known else self.regions)
@@ -124,7 +125,7 @@ class _Task(NamedTuple):
             _compute(study, subject, self.fingerprint, progress)
         if self.regions:
             table = study.path(subject, f"{REGIONS}.tsv")
-            for old in (table.with_suffix(".json"), table):  # sidecar first
+            for old in (table.with_suffix(".json"), table):  # the sidecar first, because it marks completion
                 old.unlink(missing_ok=True)
             with progress.stage("regions"):
                 source, args = study.path(subject, f"{MAP}.npz"), subject.args
@@ -140,9 +141,9 @@ def _compute(study: Study, subject: Subject, fingerprint: str, progress: StudyPr
         scaled["scaled_times"] = np.array(study.settings.times.explicit)
         own = scaled["scaled_times"] / float(positive_range(solved.pairs)[0])
         solved = solved._replace(settings=replace(solved.settings, times=Times(tuple(own.tolist()), 0)))
-    if args.noise == "residuals" and solved.volume.covariance is None:  # not saved with eigenpairs
+    if args.noise == "residuals" and solved.volume.covariance is None:  # covariances are not saved with eigenpairs
         volume = read_volume(args, StudyProgress(1, quiet=True, stream=io.StringIO()))
-        solved = solved._replace(volume=volume)
+        solved = solved._replace(volume=volume.with_mask(solved.volume.mask))
     result = signature_of(args, solved, progress)
     result = replace(result, arrays={**scaled, **result.arrays})
     drawing = partial(signature_panels, result, view=args.view)
@@ -159,5 +160,5 @@ def _pairs(study: Study, subject: Subject, progress: StudyProgress) -> Solved:
     solved = compute_pairs(read_volume(subject.args, progress), study.settings, progress)
     if study.save_pairs:
         with progress.stage("writing"):
-            write_pairs(kept, solved, image_suffix(subject.args.file), progress.warnings, fingerprint)
+            write_pairs(kept, solved, format_of(subject.args.file).image, progress.warnings, fingerprint)
     return solved

@@ -7,7 +7,7 @@ function entry(fraction) {
   return 3 * Math.max(0, Math.min(255, Math.round(255 * fraction)));
 }
 
-// A scale consists of colours and the values of the first and the last. Values that differ by rounding get one colour.
+// A scale consists of colours and the values of the first and the last colour. Values that differ by rounding get one colour.
 function scaleOf(table, low, high) {
   const least = 1e-5 * (Math.max(Math.abs(low), Math.abs(high)) || 1);
   if (high - low < least) [low, high] = [low - least / 2, high + least / 2];

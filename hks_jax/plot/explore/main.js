@@ -51,7 +51,7 @@ const byScale = (scale, numberAt) => (node, rgb) => {
   [rgb[0], rgb[1], rgb[2]] = [scale.table[e], scale.table[e + 1], scale.table[e + 2]];
 };
 
-// Values within the noise of flat space, or of the mean, fade to grey, and more so for fewer standard deviations.
+// Values within the noise of flat space, or of the mean, fade to grey. The fewer standard deviations, the greyer.
 function faded(colour) {
   const { time, quantity } = state;
   const middle = quantity === relative ? mean[time] : isFlat ? 1 : quantiles(count, (n) => values[time * count + n], [0.5])[0];

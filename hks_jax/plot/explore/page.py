@@ -54,19 +54,19 @@ def explore(
     The file contains the numbers in single precision, with 5⅓ bytes for each inside node at each time and in each map.
 
     Args:
-        result: the signature at increasing times. Nodes that are not finite at all times are omitted; on a surface, all
-            must be finite. The normalisations ``"raw"`` and ``"flat"`` are shown as (4πt)^(d/2)·HKS, which is 1 for
-            flat space without boundary, with colours that diverge from 1. With ``arrays["deviation"]``, curves of
-            points have a band, and deviations from flat space or the mean within the noise fade. Tensors, if they are
-            known, are shown as mean eigenvalue, anisotropy and principal direction (red, green and blue for x, y and
-            z). With an affine, positions are shown in space, and the sides of images have the letters L and R, P and A,
-            I and S. For the metric D⁻¹, the distance √(Dt) is shown beside t.
+        result: the signature at increasing times. Nodes without finite values at all times are omitted; on a surface,
+            all values must be finite. The normalisations ``"raw"`` and ``"flat"`` are shown as (4πt)^(d/2)·HKS, which
+            is 1 for flat space without boundary, with colours that diverge from 1. With the standard deviations
+            ``arrays["deviation"]``, curves of points have a band, and values within the noise of flat space or of the
+            mean fade. Tensors, if they are known, are shown as mean eigenvalue, anisotropy and principal direction
+            (red, green and blue for x, y and z). With an affine, positions are shown in space, and the sides of images
+            have the letters L and R, P and A, I and S. For the metric D⁻¹, the distance √(Dt) is shown beside t.
         path: the file of the page; its folder is created.
         maps: additional maps (*shape) by name.
         labels: (*shape) integers that define regions, 0 for none.
         label_names: the names of the labels.
         title: the page's title.
-        unit: the unit of t, by default that of the result.
+        unit: the unit of t, by default the result's.
 
     Returns:
         The path.
@@ -108,7 +108,7 @@ def explore(
     if size > LIMIT:
         raise ValueError(
             f"values: {t.size} times at {int(inside.sum())} nodes take {size / 1024**2:.0f} MiB; expected at most "
-            f"{LIMIT // 1024**2}, which a browser can open. Show fewer times, one slice, or part of the domain"
+            f"{LIMIT // 1024**2} MiB, which a browser can open. Show fewer times, one slice, or part of the domain"
         )
     # (4πt)^(d/2)·HKS is of order 1 in any unit, so float32 does not underflow.
     scale = result.flat_scale if result.normalisation == "raw" else 1.0
@@ -171,14 +171,14 @@ def _facts(result: Result) -> dict[str, Any]:
 
 
 def _tensor_layers(tensors: Real[ArrayLike, "*shape d d"], inside: Bool[np.ndarray, "*shape"]) -> dict[str, np.ndarray]:
-    """Return mean eigenvalue and anisotropy (n_nodes,) inside, and principal direction (n_nodes, 3) of this length."""
+    """Return mean eigenvalue, anisotropy and principal direction (n_nodes, 3), whose length is the anisotropy."""
     array, d = np.asarray(tensors, np.float64)[inside], inside.ndim
     if not np.isfinite(array).all():
         raise ValueError("tensors: got NaN or infinite values in the domain; exclude their nodes by the mask")
     values, vectors = np.linalg.eigh((array + array.swapaxes(-1, -2)) / 2)
     mean = values.mean(axis=-1)
     spread = np.sqrt(np.sum(np.square(values - mean[:, None]), axis=-1))
-    # Both are 0 for multiples of the identity, and 1 if only one eigenvalue is nonzero.
+    # Both kinds of anisotropy are 0 for multiples of the identity, and 1 if only one eigenvalue is nonzero.
     size = np.abs(values.sum(axis=-1)) / np.sqrt(2) if d == 2 else np.sqrt(np.sum(values**2, axis=-1) / 1.5)
     anisotropy = spread / np.where(size > 0, size, 1)
     largest = np.argmax(np.abs(values), axis=-1)
@@ -229,7 +229,7 @@ def _assemble(about: dict[str, Any], numbers: dict[str, str]) -> str:
         "SCRIPT": f'(() => {{\n"use strict";\n{scripts}}})();',
     }
     pieces = (own / "page.html").read_text(encoding="utf-8").split("@@")
-    # Inserted texts are not scanned again, because a title may contain any of these words.
+    # Inserted texts are not scanned again, because a title may contain any of the placeholders.
     return "".join(filled[piece] if i % 2 else piece for i, piece in enumerate(pieces))
 
 
