@@ -241,10 +241,9 @@ def _narrowed(state: _Search, count: Number, sound: Flag, size: Scalar, least: S
     first = jnp.where(lower & (count != state.number), state.next, state.first)
     share = jnp.clip(wanted / jnp.maximum(number, 1).astype(dtype), 1 / 16, 1 / 2)
     # Without a lower end, search downwards; without an upper end, search upwards. Steps grow by a factor of four.
-    reach = size * jnp.asarray(4.0, dtype) ** (state.tries - 1).astype(dtype)
-    up = jnp.maximum(low, 0) + reach * wanted / n
+    down, up = jnp.minimum(-size, 4 * state.next), 4 * jnp.maximum(low, 0) + size * wanted / n
     bracketed = jnp.isfinite(low) & jnp.isfinite(high)
-    following = jnp.where(bracketed, low + share * (high - low), jnp.where(jnp.isfinite(high), -reach, up))
+    following = jnp.where(bracketed, low + share * (high - low), jnp.where(jnp.isfinite(high), down, up))
     # If the count is uncertain, count at a slightly larger shift.
     beside = state.next + 1e-3 * jnp.where(bracketed, high - low, size * wanted / n)
     few, tries = (number <= 2 * wanted) | (high - low <= _NARROW * least), state.tries + 1
