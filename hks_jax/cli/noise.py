@@ -135,13 +135,10 @@ def _error_bars(
         domain = noisy.domain(D)
         return hj.hks(hj.eigenpairs(domain, pairs.k, settings.boundary, settings.solver), times, settings.normalisation)
 
-    def keep(one: Any) -> None:
-        maps.append(np.asarray(one, np.float32))
-
     with progress.stage("error bars", f"{args.draws} noisy maps"), warnings.catch_warnings():
         warnings.simplefilter("ignore", hj.AccuracyWarning)  # some warnings concern candidate times that are not chosen
-        tensors, more = noisy.tensors.astype(settings.dtype), {"draws": args.draws, "each": keep}
-        more |= {"compiled": noisy.traceable, "progress": progress.update}
+        tensors, more = noisy.tensors.astype(settings.dtype), {"draws": args.draws, "compiled": noisy.traceable}
+        more |= {"each": lambda one: maps.append(np.asarray(one, np.float32)), "progress": progress.update}
         bars = hj.uncertainty(signature, tensors, noisy.noise, method="resample", **more)
         interior = np.isfinite(np.asarray(bars.value))
         if len(pairs.pencil.parts) == 2:

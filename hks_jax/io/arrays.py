@@ -63,19 +63,20 @@ def _read_tensors(
 def volume_of(name: str, arrays: Mapping[str, Any], tensors: Float[np.ndarray, "..."], **about: Any) -> TensorVolume:
     """Return a volume of `tensors` at the position in `arrays` (see `place_of`), by default spacing 1 and origin 0."""
     mask, affine, d = arrays.get("mask"), arrays.get("affine"), tensors.shape[-1] if tensors.ndim else 0
+    axis = arrays.get("slice_axis")
     return TensorVolume(
         tensors,
         per_axis(f"{name}: spacing", arrays.get("spacing", 1.0), d),
         per_axis(f"{name}: origin", arrays.get("origin", 0.0), d),
         None if mask is None else as_mask(f"{name}: mask", mask),
         None if affine is None else _real(f"{name}: affine", affine),
+        None if axis is None else np.asarray(axis).tolist(),
         **about,
     )
 
 
 def _write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
-    slice_axis = {} if volume.slice_axis is None else {"slice_axis": volume.slice_axis}
-    write_npz(path, {**place_of(volume), name: array, **slice_axis, **extra, "provenance": record})
+    write_npz(path, {**place_of(volume), name: array, **extra, "provenance": record})
 
 
 def _write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
@@ -87,7 +88,7 @@ def _write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, An
 
 def place_of(volume: TensorVolume) -> dict[str, Any]:
     """Return the arrays that define the position of the voxels, and the mask."""
-    optional = {"mask": volume.mask, "affine": volume.affine}
+    optional = {"mask": volume.mask, "affine": volume.affine, "slice_axis": volume.slice_axis}
     given = {key: value for key, value in optional.items() if value is not None}
     return {"spacing": volume.spacing, "origin": volume.origin, **given}
 

@@ -53,7 +53,8 @@ def read_tensors(
       optional array ``mask``. An image one voxel thick gives 2×2 tensors if the components across it are zero.
     - npz: the array ``tensors`` (nx, ny, 2, 2) or (nx, ny, nz, 3, 3), where array axis a runs along coordinate a,
       or with six components (three in the plane) if `order` is given. Optional arrays are ``spacing`` (d,) = 1,
-      ``origin`` (d,) = 0, ``mask`` (*shape,), ``affine`` (4, 4), ``order`` and ``frame``. npy: only the tensors.
+      ``origin`` (d,) = 0, ``mask`` (*shape,), ``affine`` (4, 4), ``slice_axis``, ``order`` and ``frame``. npy: only the
+      tensors.
 
     Args:
         path: the file, or six files.

@@ -110,7 +110,7 @@ def _compare_ply(content: bytes, mesh: Any) -> None:
     of_blocks = (len(b.data) * (length + index * b.data.shape[1] + cell) for b in mesh.cells)
     wanted, got = len(mesh.points) * point + sum(of_blocks), len(body.split() if ascii_ else body)
     if wanted != got:
-        raise ValueError(f"got {got} {'words' if ascii_ else 'bytes'}; expected {wanted} for its points and cells")
+        raise ValueError(f"got {got} {'words' if ascii_ else 'bytes'} of points and cells; expected {wanted}")
 
 
 def _declared_by_gmsh(content: bytes) -> tuple[int, int, int]:

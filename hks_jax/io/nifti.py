@@ -244,7 +244,7 @@ def _write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra
 
 def _write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
     if volume.dimension != 3:
-        raise ValueError("volume: got a slice, but NIfTI has no 2×2 tensors. Write .npz, .nrrd, .vti or a volume")
+        raise ValueError("volume: got a slice, but NIfTI has no 2×2 tensors. Use .npz, .nrrd or .vti")
     require_symmetric(volume)
     components = np.where(volume.inside[..., None, None], pack(volume.tensors, "nifti")[..., None, :], 0)
     image = optional("nibabel").Nifti1Image(components, volume.volume_affine)

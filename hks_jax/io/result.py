@@ -103,7 +103,6 @@ class Result:
             about: dict[str, Any] = {"order": record.get("order", "matrix"), "frame": record.get("frame", "voxel")}
             about |= {"source": record.get("source") or "", "digest": record.get("sha256") or ""}
             about |= {"notes": tuple(record.get("notes", ()))}
-            about["slice_axis"] = int(arrays["slice_axis"]) if "slice_axis" in arrays else None
             place = volume_of(str(path), arrays, tensors, **about)
         elif "cells" in arrays:
             place = TetMesh(arrays["vertices"], arrays["cells"])

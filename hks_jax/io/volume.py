@@ -110,6 +110,8 @@ class TensorVolume:
             raise ValueError(f"{where}mask: got shape {mask.shape}, {mask.dtype}; expected booleans of shape {shape}")
         if self.affine is not None and (self.affine.shape != (4, 4) or not np.isfinite(self.affine).all()):
             raise ValueError(f"{where}affine: got shape {self.affine.shape}; expected finite numbers of shape (4, 4)")
+        if self.slice_axis not in ((None,) if d == 3 else (None, 0, 1, 2)):
+            raise ValueError(f"{where}slice_axis: got {self.slice_axis} for {d} axes; expected 0, 1 or 2 for a slice")
         if covariance is not None and covariance.shape != (*shape, *[d * (d + 1) // 2] * 2):
             raise ValueError(f"{where}covariance: got shape {covariance.shape}; expected (*shape, m, m), m = d(d+1)/2")
 

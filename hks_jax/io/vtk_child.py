@@ -34,7 +34,7 @@ def surface(data: Any) -> dict[str, Any]:
         if corners.size and not 0 <= corners.min() <= corners.max() < data.GetNumberOfPoints():
             raise ValueError(f"a polygon refers to point {corners.max()}; expected 0 … {data.GetNumberOfPoints() - 1}")
         if ends.size and (ends[0] != 0 or ends[-1] != corners.size or (np.diff(ends) < 3).any()):
-            raise ValueError("got polygon offsets that do not ascend from 0 to the number of corners by 3 or more")
+            raise ValueError("expected offsets of polygons from 0 to the number of corners, in steps of 3 or more")
     cut = vtkTriangleFilter()
     cut.PassLinesOff()
     cut.PassVertsOff()

@@ -7,6 +7,7 @@ import json
 import os
 import stat
 import sys
+from dataclasses import replace
 
 import nibabel as nib
 import numpy as np
@@ -149,7 +150,7 @@ def test_npz_round_trip_keeps_everything(tmp_path, volume):
         np.testing.assert_array_equal(read.tensors, v.tensors)
         np.testing.assert_array_equal(read.mask, v.mask)
         np.testing.assert_array_equal(read.affine, v.affine)
-        assert (read.spacing, read.origin) == (v.spacing, v.origin)
+        assert (read.spacing, read.origin, read.slice_axis) == (v.spacing, v.origin, v.slice_axis)
 
 
 def test_npz_defaults(tmp_path):
@@ -389,6 +390,8 @@ def test_results_that_cannot_be_saved(tmp_path, volume):
         hj.io.save(tmp_path / "v.txt", np.zeros(SHAPE), volume)
     with pytest.raises(ValueError, match="NIfTI allows only times"):
         hj.io.save(tmp_path / "v.nii", np.zeros(SHAPE), volume, extra={"eigenvalues": [1]})
+    with pytest.raises(ValueError, match="slice_axis: got 3 for 2 axes"):
+        replace(volume.slice("z", 1), slice_axis=3)
     with pytest.raises(ValueError, match="no 2×2 tensors"):
         hj.io.save_tensors(tmp_path / "v.nii", volume.slice("z", 1))
     assert list(tmp_path.iterdir()) == []

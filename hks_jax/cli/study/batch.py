@@ -252,5 +252,5 @@ def _only(subjects: list[Subject], names: list[str] | None) -> list[Subject]:
     chosen = [subject for subject in subjects if {subject.name, subject.participant} & wanted]
     missing = wanted - {name for subject in chosen for name in (subject.name, subject.participant)}
     if missing:
-        raise ValueError(f"--only: got {', '.join(sorted(missing))}; expected subjects in the table")
+        raise ValueError(f"--only: got {', '.join(sorted(missing))}; expected names of subjects in the table")
     return chosen

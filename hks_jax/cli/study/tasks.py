@@ -53,10 +53,12 @@ def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debu
     plan = []
     for subject in subjects:
         try:
-            plan.append(_Task.of(study, subject))
+            fingerprint = study.fingerprint(subject)
+            regions = "" if subject.args.atlas is None else study.regions_fingerprint(subject, fingerprint)
+            plan.append(_Task(study, subject, fingerprint, regions))
         except Exception as error:
             failed(subject, error)
-    pending = [task for task in plan if task.signature or task.regions]
+    pending = [task for task in plan if task.missing]
     # If a subject ended an earlier process, perhaps by lack of memory, it may do so again, so it comes last.
     pending.sort(key=lambda task: task.attempt.exists())
     if len(pending) < len(plan):
@@ -70,14 +72,14 @@ def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debu
                 with claim(task.attempt) as ours:
                     if not ours:
                         elsewhere.append(task)
-                    elif (left := task.left()) is None:
+                    elif not task.missing:  # another process has done the task
                         progress.total -= 1
                     else:
                         if number and number % FORGETFUL == 0:
                             jax.clear_caches()
                         number += 1
                         with progress.subject(task.subject.name):
-                            left.run(progress)
+                            task.run(progress)
             except Exception as error:
                 failed(task.subject, error)
         if len(elsewhere) == len(pending):
@@ -96,34 +98,24 @@ class _Task(NamedTuple):
     study: Study
     subject: Subject
     fingerprint: str
-    signature: bool
     regions: str
-
-    @classmethod
-    def of(cls, study: Study, subject: Subject) -> "_Task":
-        """Return the task for a subject, with the parts whose files are missing or have another fingerprint."""
-        fingerprint = study.fingerprint(subject)
-        regions = "" if subject.args.atlas is None else study.regions_fingerprint(subject, fingerprint)
-        task = cls(study, subject, fingerprint, True, regions)
-        return task.left() or task._replace(signature=False, regions="")
 
     @property
     def attempt(self) -> Path:
         """The file that a process locks while it computes a subject; it remains if the process is killed."""
         return self.study.folder / self.subject.folder / ".attempt"
 
-    def left(self) -> "_Task | None":
-        """Return the parts that are still missing, or None if other processes have done them."""
-        missing = self.signature and not self.study.has(self.subject, MAP, self.fingerprint)
-        known = not missing and self.study.has(self.subject, REGIONS, self.regions)
-        left = self._replace(signature=missing, regions="" if known else self.regions)
-        return left if left.signature or left.regions else None
+    @property
+    def missing(self) -> list[str]:
+        """The results, `MAP` or `REGIONS`, that do not exist or have another fingerprint."""
+        wanted = {MAP: self.fingerprint} | ({REGIONS: self.regions} if self.regions else {})
+        return [kind for kind, fingerprint in wanted.items() if not self.study.has(self.subject, kind, fingerprint)]
 
     def run(self, progress: StudyProgress) -> None:
         study, subject = self.study, self.subject
-        if self.signature:
-            _compute(study, subject, self.fingerprint, progress)
-        if self.regions:
+        if MAP in self.missing:
+            _compute(study, subject, self.fingerprint, progress)  # removes the table of regions
+        if REGIONS in self.missing:
             table = study.path(subject, f"{REGIONS}.tsv")
             for old in (table.with_suffix(".json"), table):  # the sidecar first, because it marks completion
                 old.unlink(missing_ok=True)
