@@ -30,7 +30,7 @@ def read_volume(args: argparse.Namespace, progress: Progress) -> TensorVolume:
     require_metric(args)
     volume = read(args, progress)
     if 1 in volume.shape:
-        raise ValueError(f"--slice: got a volume one voxel thick. Pass --slice {'xyz'[volume.shape.index(1)]}=0")
+        raise ValueError(f"--slice: the volume is one voxel thick. Pass --slice {'xyz'[volume.shape.index(1)]}=0")
     require_valid(volume.with_mask(volume.grid(args.components).mask), "--repair")
     return volume
 

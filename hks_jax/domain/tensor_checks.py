@@ -120,8 +120,8 @@ def right_cauchy_green(name: str, grid: Grid, F: Any) -> Float[Array, "*shape d 
     if shape != grid.shape or n != d or m < d:
         expected = (*grid.shape, d, d)
         raise ValueError(
-            f"{name}: got shape {gradients.shape}; expected one gradient per node, (*grid.shape, d, d) = {expected}. "
-            "For a map into a space of more dimensions, gradients have more rows than columns"
+            f"{name}: got shape {gradients.shape}; expected one gradient per node, (*grid.shape, d, d) = {expected}, "
+            f"or (*grid.shape, m, {d}) for a map into a space of m > {d} dimensions"
         )
     if m == d and not is_traced(gradients):
         known = np.asarray(gradients, np.float64)
@@ -169,7 +169,7 @@ def positive_map(
         choices = " or ".join(f'"{choice}" ({does})' for choice, does in MAPS.items())
         raise ValueError(f"how: got {how!r}; expected {choices}. There is no default: choose one")
     if number is None:
-        raise ValueError(f"number: got None; expected the {NUMBERS[how]} of the map {how!r}, in the units of {name}")
+        raise ValueError(f"number: got None; how={how!r} requires the {NUMBERS[how]}, in the units of {name}")
     require_number("number", number, above=0.0 if how == "exp" else -math.inf)
     known = not is_traced((tensors, number))
     if known:

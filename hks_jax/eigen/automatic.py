@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from hks_jax.compilation import is_concrete_on_cpu
-from hks_jax.eigen.complement.factorised_adjoint import FactorisedAdjoint
+from hks_jax.eigen.adjoints.factorised_adjoint import FactorisedAdjoint
 from hks_jax.eigen.filter.chebyshev_filter import ChebyshevFilter
 from hks_jax.eigen.host.shift_invert import ShiftInvert
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos

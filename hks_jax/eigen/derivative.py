@@ -11,8 +11,8 @@ from jaxtyping import Array, Bool, Float
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.compilation import jit_quickly, numpy_where_known
-from hks_jax.eigen.complement.adjoint import Adjoint, OfRows, Rows, Scalar, Values, Vectors, unsolved
-from hks_jax.eigen.complement.factorised_adjoint import InteriorAdjoint
+from hks_jax.eigen.adjoints.adjoint import Adjoint, OfRows, Rows, Scalar, Values, Vectors, unsolved
+from hks_jax.eigen.adjoints.factorised_adjoint import InteriorAdjoint
 from hks_jax.eigen.lanczos.block_lanczos import first_from_origin
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report

@@ -56,7 +56,7 @@ def eigenpairs(
             concrete values, ``"shift-invert"`` works too. Derivatives in an interval use only the tolerance of the
             solver's ``adjoint``.
         mass: ``"consistent"`` or ``"lumped"``. Only for fields and meshes.
-        multiplet: the treatment of a multiple eigenvalue that k cuts; an interval cuts none. ``"report"`` warns.
+        multiplet: the treatment of a multiple eigenvalue that k cuts; unused in an interval. ``"report"`` warns.
             ``"drop"`` excludes its pairs from every signature. ``"complete"`` computes 8 additional pairs and includes
             the missing ones, or drops the eigenvalue if 8 are too few. ``.kept`` marks the included pairs.
         throw: whether to raise an error if ``.result`` is not successful or derivatives do not converge; under `jit`, a

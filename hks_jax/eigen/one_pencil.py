@@ -13,7 +13,7 @@ from jaxtyping import Array, Int
 from hks_jax.arrays import jax_array
 from hks_jax.checks import require_count
 from hks_jax.compilation import is_concrete_on_cpu, jit_quickly, numpy_where_known
-from hks_jax.eigen.complement.adjoint import Scalar
+from hks_jax.eigen.adjoints.adjoint import Scalar
 from hks_jax.eigen.derivative import frame_of_chosen, solved
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.host.shift_invert import ShiftInvert, lower_bound

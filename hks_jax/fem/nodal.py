@@ -81,7 +81,7 @@ class NodalPencil(eqx.Module):
 
 
 def lump(stiffness: Stencil, mass: Stencil, free: Bool[Array, "*shape"], domain: Bool[Array, "*shape"]) -> NodalPencil:
-    """Return the pencil of these matrices, with the row sums of the mass."""
+    """Return the pencil of these matrices, together with the row sums of the mass."""
     sums = jnp.where(free, jnp.sum(mass.coefficients, axis=0), 1)
     return NodalPencil(stiffness, mass, jax.lax.stop_gradient(sums), free, domain)
 

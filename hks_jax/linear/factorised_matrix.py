@@ -55,9 +55,9 @@ class FactorisedMatrix(eqx.Module):
         factor: LDLᵀ. Derivatives treat the factorisation as a constant.
         sound: whether a test with random right-hand sides shows that the factorisation is accurate enough. Then its
             inertia is that of A, and iterative refinement converges. Otherwise results are NaN.
-        error: an estimate of ‖I − AF⁻¹‖ in the Frobenius norm, where F is the computed LDLᵀ. This is about the error of
-            log|det A| and the relative error of A⁻¹. The estimate is infinite if pivots were replaced; then log|det A|
-            and A⁻¹ are NaN. Solutions are refined, and more accurate.
+        error: an estimate of ‖I − AF⁻¹‖ in the Frobenius norm, where F is the computed LDLᵀ. The error of log|det A|
+            and the relative error of A⁻¹ are about as large. The estimate is infinite if pivots were replaced; then
+            log|det A| and A⁻¹ are NaN. Solutions are refined, and more accurate.
     """
 
     matrix: PatternedOperator

@@ -51,7 +51,7 @@ class Count(NamedTuple):
 
 
 def count(field: TensorField, rule: str, periodic: bool = False) -> Count:
-    """Triangulate the grid of a field, measure all edges by a rule, and count violations."""
+    """Triangulate a field's grid, measure its edges, and count triangles that violate the triangle inequality."""
     grid, (faces, places) = field.grid, _triangles(field.grid, periodic)
     tensors = np.asarray(field.tensors, dtype=np.float64).reshape(-1, 2, 2)
     sides = []

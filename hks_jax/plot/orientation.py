@@ -112,7 +112,7 @@ class Orientation(NamedTuple):
         return tuple(shape[a] - 1 - node[a] if turn else node[a] for a, turn in turned)
 
     def letter(self, ax: Axes, plane: tuple[int, int] = (0, 1)) -> None:
-        """Write the letters at the edges of an image of two axes, and mirror it for the radiological view."""
+        """Write letters at the edges of an image in a plane of two axes; mirror it if the view is radiological."""
         horizontal, vertical = (self.ends[a] for a in plane)
         left, right, bottom, top = *horizontal, *vertical
         if self.view == "radiological" and horizontal == LETTERS[0]:

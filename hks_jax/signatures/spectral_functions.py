@@ -105,8 +105,8 @@ def _weighted(contraction: Contraction, weights: Float[Array, "m k"], vectors: F
 # where xᵢ is the derivative of the frame (hks_jax/eigen/derivative.py). Pairs in the arrays that are not kept have
 # f = 0. Under "mirror" and "mean" the differential is the sum over the parts, whose pairs do not mix.
 #
-# Signatures use the kernel RΦ f(Λ) ΦᵀRᵀ at the nodes (`Pencil.read`). Then R multiplies each φ and x from the left, and
-# f(λᵢ) ((dR φᵢ)(Rφᵢ)ᵀ + (Rφᵢ)(dR φᵢ)ᵀ) is added to the sum.
+# Let R map coefficients to values at the nodes (`Pencil.read`). Signatures use the kernel RΦ f(Λ) ΦᵀRᵀ. Then R
+# multiplies each φ and x from the left, and f(λᵢ) ((dR φᵢ)(Rφᵢ)ᵀ + (Rφᵢ)(dR φᵢ)ᵀ) is added to the sum.
 @partial(_kernel.defjvp, symbolic_zeros=True)
 def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     (contraction, filters, pairs), (d_contraction, d_filters, d_pairs) = primals, tangents

@@ -68,7 +68,7 @@ def choose_method(pencil: AnyPencil, times: Float[Array, " m"], method: Method, 
 def least_work(pencil: AnyPencil, times: Float[Array, " m"], tolerance: float) -> Colouring | None:
     """Return the colouring if it takes less work than selected inversion, or None.
 
-    If selected inversion needs too much memory, a mesh or the errors of `plan` raise `Unattainable`.
+    If selected inversion needs too much memory, `Unattainable` is raised for a mesh, and where `plan` raises it.
     """
     of_inversion = work(None, pencil, times)
     affordable = math.isfinite(of_inversion)

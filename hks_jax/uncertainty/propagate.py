@@ -251,7 +251,10 @@ def _white(noise: TensorNoise, seed: Any, index: Any, dtype: Any) -> Array:
 
 @jax.jit
 def _four(measured: Array, noise: TensorNoise, seed: Any, index: Any) -> tuple[list[Array], Array]:
-    """Return four tensor fields with halved noise of sum zero, and the sum of the indefinite shares for full noise."""
+    """Return four noisy fields, and the sum of their shares of tensors that the full noise would make indefinite.
+
+    Each field contains half of its noise, and the four noises have the sum zero.
+    """
     each = jnp.stack([noise.tensors(_white(noise, seed, 3 * index + i, measured.dtype)) for i in range(3)])
     changes = jnp.tensordot(
         jnp.asarray(_SIGNS / math.sqrt(3), each.dtype), each, 1, precision=jax.lax.Precision.HIGHEST

@@ -9,7 +9,7 @@ import scipy.sparse as sp
 from pencils import directions, graph_laplacian, indefinite, lattice
 
 import hks_jax as hj
-from hks_jax.eigen.complement.factorised_adjoint import InteriorAdjoint
+from hks_jax.eigen.adjoints.factorised_adjoint import InteriorAdjoint
 from hks_jax.eigen.inertia import certain_count, lowered, translated
 
 SOLVER = hj.BlockLanczos(block=4)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hks_jax as hj
-from hks_jax.eigen.complement.factorised_adjoint import FactorisedAdjoint
+from hks_jax.eigen.adjoints.factorised_adjoint import FactorisedAdjoint
 from hks_jax.inverse import Data
 from hks_jax.inverse.observation import observe
 from hks_jax.inverse.problem import Problem

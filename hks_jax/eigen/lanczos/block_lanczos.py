@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from hks_jax.checks import require_count
 from hks_jax.compilation import jit_quickly
-from hks_jax.eigen.complement.adjoint import Values, Vectors
+from hks_jax.eigen.adjoints.adjoint import Values, Vectors
 from hks_jax.eigen.inertia import LocatedPencil, Number, dissected, lowered, translated
 from hks_jax.eigen.lanczos.slicing import cut, search
 from hks_jax.eigen.lanczos.slicing_state import Plan, Problem, SlicingState, Stored, first_state, unfinished

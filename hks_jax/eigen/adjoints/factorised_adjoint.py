@@ -1,6 +1,6 @@
 """Linear solves with K − λᵢM on the complement of computed eigenvectors, all in JAX.
 
-The method is described in `hks_jax.eigen.complement.adjoint`: conjugate gradients with a factorisation of K − σM as
+The method is described in `hks_jax.eigen.adjoints.adjoint`: conjugate gradients with a factorisation of K − σM as
 preconditioner for each group of neighbouring eigenvalues. Groups are formed by index instead of value, so that shapes
 are static; by Weyl's law, the distribution of eigenvalues is regular enough. All products with the Jacobian at one
 point share the factorisations.
@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hks_jax.compilation import is_concrete_on_cpu, jit_quickly
-from hks_jax.eigen.complement import adjoint as complement
-from hks_jax.eigen.complement.adjoint import Adjoint, Columns, OfRows, Rows, Scalar, Shifts, Values, Vectors
+from hks_jax.eigen.adjoints import adjoint as complement
+from hks_jax.eigen.adjoints.adjoint import Adjoint, Columns, OfRows, Rows, Scalar, Shifts, Values, Vectors
 from hks_jax.eigen.inertia import LocatedPencil
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
 from hks_jax.linear.dissection import Dissection, dissect
