@@ -237,7 +237,7 @@ def mesh_nodes(mesh: SimplicialMesh, degree: int, midpoints: Any) -> Float[Array
     moved = real_array("midpoints", moved)
     if moved.shape != middles.shape:
         raise ValueError(
-            f"midpoints: got shape {moved.shape}; expected shape {middles.shape}, one position for each edge of "
+            f"midpoints: got shape {moved.shape}; expected {middles.shape}, one position for each edge of "
             "mesh.triangulation.edges, or a function that maps a position (3,) to another one"
         )
     return jnp.concatenate([vertices, moved.astype(vertices.dtype)])

@@ -170,7 +170,7 @@ def test_indefinite_tensors_are_refused_with_the_maps(tmp_path, capsys):
         hj.TensorField(grid, STRESS)
     with unchecked(), pytest.raises(ValueError, match=r'"exp" \(exp.*"shift".*There is no default'):
         hj.TensorField.from_indefinite(grid, STRESS)
-    with pytest.raises(ValueError, match="number: got None; how=.* requires the scale"):
+    with pytest.raises(ValueError, match=r"number: got None; how=.* requires the scale"):
         hj.TensorField.from_indefinite(grid, STRESS, "exp")
     least = np.linalg.eigvalsh(STRESS[MASK]).min()
     with pytest.raises(ValueError, match=rf"least eigenvalue is {least:g}; expected more than {-least:g}"):
