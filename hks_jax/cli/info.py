@@ -52,7 +52,7 @@ def run(args: argparse.Namespace, progress: Progress) -> None:
 
 
 def _result_of(path: Path) -> Result | None:
-    """Return the result in an npz, in its folder, or in the npz beside its image; None for other files."""
+    """Return the result in an npz, in the npz of a folder, or in the npz beside an image; None for other files."""
     file = signature_file(path) if path.is_dir() else Path(str(path).removesuffix(".gz")).with_suffix(".npz")
     return Result.read(file) if arrays_in(file).intersection(NAMES) else None
 

@@ -32,7 +32,7 @@ class ComputationError(RuntimeError):
 class Settings:
     """The settings of a computation, with the names of the options.
 
-    The metric is None only for meshes. The boundary None means `default_boundary` for a volume, neumann for a mesh.
+    The metric is None only for meshes. For the boundary, None means `default_boundary` for volumes, neumann for meshes.
     """
 
     metric: MetricChoice | None

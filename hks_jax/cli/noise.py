@@ -148,7 +148,7 @@ def _error_bars(
     chosen = np.arange(len(times))
     if not settings.times.explicit:
         ratio = np.asarray(bars.signal_to_noise_at(interior))
-        ratio = np.where(np.isfinite(ratio), ratio, np.asarray(bars.signal_to_noise))  # if the interior is empty
+        ratio = np.where(np.isfinite(ratio), ratio, np.asarray(bars.signal_to_noise))  # for an empty interior
         clear = np.flatnonzero(ratio >= _SIGNAL)
         first = min(int(clear[0]), len(times) - wanted) if clear.size else 0
         chosen = np.rint(np.linspace(first, len(times) - 1, wanted)).astype(int)

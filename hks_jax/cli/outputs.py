@@ -46,9 +46,9 @@ def show(args: argparse.Namespace, done: Done) -> None:
 def writing(
     folder: Path, report: Mapping[str, Any], progress: Progress, stale: Callable[[], Iterable[Path]] = tuple
 ) -> Iterator[tuple[Path, Done]]:
-    """Yield a temporary folder and a `Done`; the report and the paths of the results are added to it at the end.
+    """Yield a temporary folder and a `Done`, to which the report and the paths of the results are added at the end.
 
-    Then report.json is also written, all files are moved to `folder` atomically, and the `stale` files are deleted.
+    At the end, report.json is also written, all files are moved to `folder` atomically, and `stale` files are deleted.
     """
     done = Done([], {})
     with progress.stage("writing", str(folder)), atomic_folder(folder, stale) as temporary:

@@ -26,7 +26,7 @@ def bar(done: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Return a duration as text, rounded as befits an estimate: ``40 s``, ``3 min``, ``1 h 20 min``."""
+    """Return a duration as text, rounded to the accuracy of estimates: ``40 s``, ``3 min``, ``1 h 20 min``."""
     if seconds < 95:
         return f"{max(5 * round(seconds / 5), 5)} s"
     minutes = round(seconds / 60)
@@ -151,7 +151,7 @@ class StudyProgress(Progress):
     """Progress over many subjects: the number of finished subjects, and the estimated time for the others.
 
     On a terminal, one line shows a bar and the stages of the current subject. Otherwise, a line is printed at the
-    beginning and at the end of each subject. Warnings include the name of the subject, and its sidecar contains them.
+    beginning and at the end of each subject. Warnings begin with the subject's name; the subject's sidecar stores them.
     """
 
     _LINE_END = "\r\x1b[K"

@@ -79,7 +79,7 @@ def sliced(volume: TensorVolume, axis: str, index: int) -> TensorVolume:
 
 
 def _load(args: argparse.Namespace) -> tuple[TensorVolume, np.ndarray | None]:
-    """Return the volume, and the mask of ``--mask`` unless it is the mask of the volume already."""
+    """Return the volume, and the mask of ``--mask`` unless the volume has this mask already."""
     if args.bval is None and args.bvec is None:
         refuse(args, ("b_max",), "this option is for diffusion-weighted images; pass --bval and --bvec too")
         refuse(args, ("bvec_frame",), "this option is for diffusion-weighted images; for tensors pass --frame")
@@ -100,7 +100,7 @@ def _load(args: argparse.Namespace) -> tuple[TensorVolume, np.ndarray | None]:
 
 
 def _without_filling(volume: TensorVolume, background: str | None, progress: Progress) -> TensorVolume:
-    """Exclude the background if ``--background outside`` is given; warn about it if the option is not given."""
+    """Exclude the background if ``--background outside`` is given; without the option, warn of a background."""
     found = None if background == "inside" else find_background(volume)
     if found is None:
         return volume

@@ -16,7 +16,7 @@ from hks_jax.io.repair import REPAIRS
 
 
 def _reader(expected: str, read: Callable[[str], Any]) -> Callable[[str], Any]:
-    """Return a parser of texts that raises an error, which states what is `expected`, if `read` returns None."""
+    """Return a parser that applies `read` to a text; if the result is None, the parser's error states `expected`."""
 
     def parse(text: str) -> Any:
         if (value := read(text)) is None:
@@ -54,7 +54,7 @@ def parse_boundary(text: str) -> BoundarySpec:
 
 
 class Times(NamedTuple):
-    """Explicit times, or the number of automatic ones."""
+    """Explicit times, or the number of automatic times."""
 
     explicit: tuple[float, ...]
     automatic: int

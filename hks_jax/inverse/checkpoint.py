@@ -26,7 +26,7 @@ class Checkpoint:
 
 
 def fingerprint(*parts: Any) -> str:
-    """Return a hash of arrays and settings. Functions enter by name, which is the same in every process."""
+    """Return a hash of arrays, settings and names of functions, which is the same in every process."""
     digest = hashlib.blake2b(digest_size=16)
     for leaf in jax.tree.leaves(parts):
         text = getattr(leaf, "__qualname__", repr(leaf)).encode()

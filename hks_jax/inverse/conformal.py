@@ -29,23 +29,23 @@ class InnerProduct(eqx.Module):
         return values
 
     def precondition(self, values: Values, damping: Float[Array, ""]) -> Values:
-        """Return the result of `solve`, for a system whose matrix JᵀJ is not known."""
+        """Return the result of `solve`, a preconditioner that ignores the damping and the data."""
         return self.solve(values)
 
 
 class Smoothing(InnerProduct):
     """The inner product ⟨x, y⟩ + ℓ²⟨∇x, ∇y⟩ of each component, where ℓ is the length below which steps are smooth.
 
-    The inner product has a mass matrix, because a node at the boundary has only half a cell and affects the data less.
+    The inner product has a mass matrix, because a boundary node has only half a cell and affects the data less.
     """
 
-    pencil: Pencil  # stiffness and lumped mass of the flat metric
+    pencil: Pencil  # the stiffness K and the lumped mass M of the flat metric
     factor: Factorisation | None  # the factorisation of K + M/ℓ²; None for ℓ = 0
     length: Float[Array, ""]  # ℓ, in coordinate units
     cell: Float[Array, ""]  # the mean mass of a node, which all masses are divided by
 
     def apply(self, values: Values) -> Values:
-        """Return (M + ℓ²K) x divided by the mass of a cell."""
+        """Return (M + ℓ²K) x for the unknowns x, divided by the mass of a cell."""
         x = values.T
         return ((self.pencil.mass.apply(x) + self.length**2 * self.pencil.stiffness.apply(x)) / self.cell).T
 
@@ -68,30 +68,30 @@ def smoothing(grid: Grid, length: float, dtype: np.dtype) -> Smoothing:
 
 
 _TOP = 0.03
-"""The size of the eigenvalues of JᵀJ at the maximum of a(λt)², for weights that add up to one."""
+"""The size of the largest eigenvalues of JᵀJ, where J is the Jacobian of the data, for weights that add up to one."""
 _POWER, _REACH = 3, 9.0
-"""The preconditioner (1 + λt/9)³ took nearly the fewest steps of all such powers on 32² and 64² nodes."""
+"""Of all preconditioners (1 + λt/a)ⁿ, this power n and this a took nearly the fewest steps on 32² and 64² nodes."""
 
 
 # In the plane the metric (1 + εu) I has the Laplacian (1 − εu) Δ and the area element (1 + εu) dx. By Duhamel's formula
-# its signature is h₀ (1 + εv) with h₀ = 1/(4πt). For u = exp(iξx) and x = t|ξ|²,
+# its signature is h₀ (1 + εv) with h₀ = 1/(4πt). For u(z) = exp(iξ·z) and x = t|ξ|²,
 #
 #     v = a(x) u,    a(x) = ∫₀¹ (1 + x (1 − s)²) exp(−x s (1 − s)) ds − 1.
 #
-# For small x, a(x) is x/6, the contribution tK/3 of the curvature; for large x it is of order 1/x. So JᵀJ is about
-# Σₜ wₜ a(tL)², where L is the Laplacian. Except for the first few, the eigenvalues of JᵀJ decrease as those of L
-# increase. On a grid they decrease faster, because interpolation between nodes damps oscillations of the factor.
+# For small x, a(x) is x/6, which is the contribution tK/3 of the curvature K; for large x, a(x) is of order 1/x. So JᵀJ
+# is about Σₜ wₜ a(tL)², where wₜ are the weights of the times and L is the Laplacian. Except for the first few, the
+# eigenvalues of JᵀJ decrease with frequency. On a grid they decrease faster, because interpolation damps oscillations.
 class ConformalInformation(eqx.Module):
     """The preconditioner B½ (1 + L/λ₁)⁻³ B½, where B is the lumped mass and L is a Laplacian of the initial metric.
 
-    The inverse is a polynomial of L, which takes three products with L. The eigenvalues of JᵀJ + μB are at least about
-    μ. So are the eigenvalues of the preconditioner, because λ₁ is large enough.
+    Applying its inverse takes three products with L. The matrix of the fit is JᵀJ + μB with the damping μ, so its
+    eigenvalues are at least about μ. The parameter λ₁ is so large that the preconditioner has the same bound.
     """
 
     unknowns: Nodal  # the conformal factors at the nodes
     root: Float[Array, "n 1"]  # the square roots of the masses, relative to the mass of a cell
     weights: list[Float[Array, "..."]]  # the weights of the edges along each axis
-    level: Float[Array, ""]  # λ₁ without damping
+    level: Float[Array, ""]  # the parameter λ₁ without damping
     largest: Float[Array, ""]  # a bound on the eigenvalues of L
 
     def precondition(self, values: Values, damping: Float[Array, ""]) -> Values:

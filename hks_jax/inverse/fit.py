@@ -52,23 +52,23 @@ def fit_metric(
             kernel signature is (n_energies, *grid.shape), a heat trace (n_times,), and eigenvalues are (m,) in
             ascending order, including zeros.
         times: (n_times,) times, or the energies of a wave kernel signature; None if the signature has neither.
-        parametrisation: ``"log-euclidean"`` or ``"cholesky"`` (the whole tensor), ``"conformal"`` (e^u T₀),
-            ``"eigenvalues"`` (with the eigenvectors of `init`), ``"rotation"`` (with the eigenvalues of `init`), a
-            `Parametrisation`, or `Free` parameters of a function.
+        parametrisation: ``"log-euclidean"`` or ``"cholesky"`` (the whole tensor), ``"conformal"`` (a factor of the
+            tensors of `init`), ``"eigenvalues"`` (with the eigenvectors of `init`), ``"rotation"`` (with the
+            eigenvalues of `init`), a `Parametrisation`, or `Free` parameters of a function.
         data: the kind of signature, the measure of differences, and the weights and noise of entries.
         regularisers: penalties from `hks_jax.inverse`: `H1`, `TotalVariation`, `LogDeterminant`, `Prior`.
-        k: the number of eigenpairs. By default only a share of 1e-6 of the heat trace at the smallest time lies beyond
-            k, by Weyl's law, or k is maximal, and k grows if the fit reaches a field of more volume. For a wave kernel
-            signature the default eigenvalues reach to 2σ above the largest energy.
+        k: the number of eigenpairs. By default, the pairs beyond k contribute a share of 1e-6 to the heat trace at the
+            smallest time, by Weyl's law, or k is maximal. The default k grows if the fit reaches a field of more
+            volume. For a wave kernel signature of width σ, energies up to 2σ above the largest energy are included.
         boundary: the same as for `eigenpairs`.
-        solver: the eigensolver; ``"auto"`` chooses one for many products with the same Jacobian.
+        solver: the eigensolver; ``"auto"`` chooses a solver that suits many products with the same Jacobian.
         search: the settings of the optimisation and its stopping criteria.
         progress: a function, such as ``print``, that is called with each step.
         checkpoint: a file that is written after each step. If the file exists, the fit resumes from it.
 
     Warns:
-        AccuracyWarning: if the misfit is close to the truncation error of k pairs, so that the fit matches its own
-            truncation, or if it stays above the noise, so that no metric found explains the target.
+        AccuracyWarning: if the misfit is close to the truncation error of k pairs, so that the fitted metric may
+            compensate for the truncation, or if the misfit stays above the noise, so that it does not explain the data.
 
     Raises:
         TypeError: if `init` is neither a grid nor a field.

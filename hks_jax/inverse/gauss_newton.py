@@ -20,11 +20,11 @@ _Options = dict[str, Any]
 _Tags = frozenset[object]
 
 _TIGHTER, _LONGER = 30, 3
-"""The factors by which accuracy and products increase in the linear systems of steps that may be the last."""
+"""For a step that may be the last, the factors of the linear system's accuracy and of its maximum of products."""
 _ACCEPTED, _GOOD, _SHRINKING = 0.01, 0.5, 0.25
-"""The shares of the predicted reduction that accept a step and reduce damping; the step size's factor on rejection."""
+"""The shares of the predicted reduction to accept a step and to reduce damping; the step size's factor on rejection."""
 _FREE = 0.01
-"""The largest share of damping in a step's curvature for which the step estimates the distance to the solution."""
+"""A step estimates the distance to the solution if damping contributes at most this share of its curvature."""
 
 
 class _State(eqx.Module):
@@ -33,13 +33,13 @@ class _State(eqx.Module):
     first: Bool[Array, ""]  # whether no unknowns have been accepted yet
     trial: Values  # the unknowns to be evaluated next
     finite: Bool[Array, ""]  # whether the last step is finite
-    step_size: Float[Array, ""]  # 1/μ, relative to that of the first step
+    step_size: Float[Array, ""]  # 1/μ for the damping μ, relative to the first step
     linearised: Any  # residuals and Jacobian at the last accepted unknowns
     aux: Any  # the auxiliary output of the residuals at these unknowns
     gradient: Values  # the gradient at these unknowns
     promised: Float[Array, ""]  # the linearised change of half the sum of squares by the last step
     change: Float[Array, ""]  # the size of the last accepted step, relative to the tolerance
-    damped: Float[Array, ""]  # xᵀBx over the curvature of this step x; μ times this ratio is the share of damping
+    damped: Float[Array, ""]  # xᵀBx / curvature for this step x; μ times this ratio is the share of damping
     tight: Bool[Array, ""]  # whether the linear systems are solved more exactly
     done: Bool[Array, ""]  # whether the descent has converged
 
@@ -58,9 +58,9 @@ def _empty(structure: Any) -> Any:
 class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _State]):
     """The default solver of `hks_jax.fit_metric`.
 
-    The steps δ of the solver satisfy (JᵀJ + μB) δ = −Jᵀr, where B is an inner product of the unknowns and μ = damping /
-    step size. The conjugate gradients stop early, because far from the solution the linearisation error exceeds the
-    algebraic error. Whenever the iteration stops, it returns a descent direction.
+    For the residuals r with the Jacobian J, a step δ satisfies (JᵀJ + μB) δ = −Jᵀr, where B is an inner product of the
+    unknowns and μ is the damping. The conjugate gradients for this system stop early, because far from the solution the
+    linearisation error exceeds the algebraic error. Whenever the iteration stops, it returns a descent direction.
 
     The settings are arrays, so a compiled step works for all their values.
 
@@ -69,7 +69,7 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _State]):
         damping: the damping μ of the first step, relative to the scale of the data.
         growth: the divisor of μ after a step that reduces the misfit as much as its linearisation predicts.
         inner_product: the inner product B, in whose norm steps are damped.
-        inner_tolerance: the reduction of the linear residual in a step; 30 times smaller if the step may be the last.
+        inner_tolerance: the relative residual of the linear system; 30 times smaller if the step may be the last.
         inner_steps: the maximum number of products with JᵀJ in a step; three times larger if the step may be the last.
         preconditioner: the preconditioner of the conjugate gradients; B by default.
 
@@ -118,7 +118,7 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _State]):
         moved, curvature = change > 0, -jnp.vdot(step, state.gradient)
         damped = jnp.vdot(step, self.inner_product.apply(step)) / jnp.where(curvature > 0, curvature, 1)
         damped = jnp.where(moved & (curvature > 0), damped, jnp.inf)
-        # The step or, if larger, the rest of a geometric series from the last two steps estimates the distance left.
+        # The distance to the solution is about this step or, if larger, the rest of a geometric series of the steps.
         ratio = change / state.change
         settled = moved & (ratio < 1) & (change * jnp.maximum(1, ratio / (1 - ratio)) < 1)
         # The next step may be the last: it is below the tolerance if the steps keep shrinking at this rate.
@@ -128,10 +128,10 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _State]):
         return dataclasses.replace(state, change=change, damped=damped, tight=tight, done=done)
 
     def _done(self, state: _State) -> Bool[Array, ""]:
-        """Return whether the unknowns have converged and are not merely held by damping."""
+        """Return whether the unknowns have converged, and do not merely change little because of damping."""
         return state.done & (self.damping / state.step_size * state.damped < _FREE)
 
-    # If g = Jᵀr and (JᵀJ + μB) x = g − ρ, conjugate gradients make the residual ρ orthogonal to x. So for δ = −x
+    # Let g = Jᵀr and (JᵀJ + μB) x = g − ρ. Conjugate gradients make the residual ρ orthogonal to x, so for δ = −x
     #
     #     ½|r + Jδ|² − ½|r|² = −gᵀx + ½ xᵀJᵀJx = −½ (gᵀx + μ xᵀBx).
     def _next(self, y: Values, state: _State, needed: bool | Bool[Array, ""]) -> _State:
@@ -155,7 +155,7 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _State]):
         solution = conjugate_gradients(normal, precondition, like, tolerance[None], most=most, orthogonal=True)
         x, gradient = solution.x.reshape(shape), solution.rhs.reshape(shape)
         promised = -(jnp.vdot(gradient, x) + damping * jnp.vdot(x, self.inner_product.apply(x))) / 2
-        # A stationary point needs no step; a step of size zero would show no convergence.
+        # A stationary point is a solution, but a step of size zero does not count as convergence.
         stationary = jnp.all(gradient == 0)
         done, damped = state.done | stationary, jnp.where(stationary, 0, state.damped)
         found = {"trial": y - x, "finite": jnp.all(jnp.isfinite(x)), "gradient": gradient, "promised": promised}
@@ -175,8 +175,8 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _State]):
     ) -> tuple[Values, _State, Any]:
         """Accept or reject the trial, and choose the next; return the unknowns and the auxiliary output.
 
-        Choosing the next trial is most of the work. This work is skipped if the function in the option ``"enough"`` is
-        true of the auxiliary output.
+        Choosing the next trial is most of the work. The choice is skipped if the function ``options["enough"]`` returns
+        true for the auxiliary output.
         """
         linearised, aux = _linearise(fn, state.trial, args)
         # Traces are compared by identity, so the trace of the state is used in all states.

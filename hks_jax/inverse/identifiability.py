@@ -23,9 +23,9 @@ _ROUNDS = 4
 class Identifiability(eqx.Module):
     """The directions that noisy data determine near a solution, to first order.
 
-    For independent residuals with standard deviation σ the information about the unknowns is JᵀJ/σ². With a prior of
-    standard deviation τ the data determine the share s²/(s² + σ²/τ²) of an eigenvector of JᵀJ with eigenvalue s², and
-    the prior determines the rest. The prior is white, so it does not couple neighbours.
+    For independent residuals with the standard deviation σ and the Jacobian J, the information about the unknowns is
+    JᵀJ/σ². With a prior of standard deviation τ, the data determine the share s²/(s² + σ²/τ²) of an eigenvector of JᵀJ
+    with the eigenvalue s², and the prior determines the rest. The prior is white, so it does not couple neighbours.
 
     Attributes:
         strengths: (n,) the largest eigenvalues s² of JᵀJ in descending order, for unit residual variance.
@@ -69,7 +69,7 @@ def identifiability(
     iterations: int = 4,
     seed: int = 0,
 ) -> Identifiability:
-    """Find the directions that the data of a fit determine, from products with J and Jᵀ.
+    """Find the directions that the data of a fit determine, from products with the Jacobian J and with Jᵀ.
 
     The strongest directions result from randomised subspace iteration on JᵀJ (Halko, Martinsson and Tropp 2011). The
     weakest directions result from subspace iteration with Chebyshev polynomials that damp strong directions. Weak
@@ -82,7 +82,7 @@ def identifiability(
         n_weak: the number of weak directions.
         noise: σ, the standard deviation of each entry's residual before weighting (0.01 for 1 % under ``"log"``).
         prior: τ, the prior standard deviation of every single unknown, in the units of the parametrisation.
-        iterations: the number of subspace iterations, each with n + 8 products with J and with Jᵀ.
+        iterations: the number of subspace iterations, each of which takes n + 8 products with J and n + 8 with Jᵀ.
         seed: the seed of the random initial subspace.
 
     Raises:
@@ -124,7 +124,7 @@ def identifiability(
 
 
 def _information(problem: Problem, values: Values) -> Any:
-    """Return a function that multiplies each flat direction of a batch by JᵀJ of the data's residuals."""
+    """Return a function that multiplies each flat direction of a batch by JᵀJ, where J belongs to the data."""
 
     def data(flat: Array) -> Array:
         return problem.observation.residuals(problem.pairs(flat.reshape(values.shape)))
@@ -148,7 +148,7 @@ def _weakest(problem: Problem, values: Values, start: Array, top: Float[Array, "
 
     def improve(_: Any, state: tuple[Array, Array]) -> tuple[Array, Array]:
         values, block = state
-        # The Chebyshev polynomial is small between the current weak eigenvalues and the top, and grows below them.
+        # The Chebyshev polynomial is small between the weak eigenvalues' mean and the top, and grows below this mean.
         cut = jnp.mean(values)
         centre, half = (1.1 * top + cut) / 2, (1.1 * top - cut) / 2
 

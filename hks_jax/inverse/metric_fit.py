@@ -125,8 +125,8 @@ class MetricFit:
     def uncertainty(self, prior: float = 1.0, noise: float | None = None, draws: int = 32, seed: int = 0) -> Posterior:
         """Compute first-order error bars of the fitted metric by Laplace's approximation.
 
-        The posterior of the unknowns has the covariance (JᵀΣ⁻¹J + R)⁻¹: J is the Jacobian of the data, Σ is the
-        covariance of the noise with the weights of the fit, and R is the Hessian of the penalties and a white prior.
+        The posterior of the unknowns has the covariance (JᵀΣ⁻¹J + R)⁻¹, where J is the Jacobian of the data, Σ is the
+        covariance of the noise by the weights of the fit, and R is the Hessian of the penalties and of a white prior.
         Each draw solves one linear system by conjugate gradients.
 
         Args:
@@ -154,8 +154,8 @@ class MetricFit:
         return f"MetricFit({self.result}: loss {self.loss:.3e} after {self.steps} steps)"
 
 
-# For independent standard normal ξ and ξ₀ the right-hand side Aᵀξ + ξ₀/τ has the covariance H = AᵀA + 1/τ². So the
-# solution with the matrix H has the covariance H⁻¹ (Papandreou and Yuille 2010).
+# Let A be the Jacobian of the residuals. For independent standard normal ξ and ξ₀, the vector b = Aᵀξ + ξ₀/τ has the
+# covariance H = AᵀA + 1/τ². So the solution x of Hx = b has the covariance H⁻¹ (Papandreou and Yuille 2010).
 @jit_quickly(eqx.filter_jit)
 def _deviations(
     problem: Problem, values: Values, scale: Float[Array, ""], prior: Float[Array, ""], keys: Array

@@ -98,7 +98,7 @@ class Observation(eqx.Module):
         return self.shape[0] if self.signature.lowest else self.signature.pairs_needed(k, times, pencil, field)
 
     def residuals(self, pairs: Eigenpairs) -> Float[Array, " m"]:
-        """Return the residuals, whose half sum of squares is the misfit."""
+        """Return the residuals; half the sum of their squares is the misfit."""
         return self.compare(self.predict(pairs))
 
     def compare(self, predicted: Array) -> Float[Array, " m"]:

@@ -23,7 +23,7 @@ _REJECTIONS = 12
 def _residuals(values: Values, problem: Problem) -> tuple[Array, Outcome]:
     """Return residuals and, as auxiliary output, the outcome.
 
-    The number of nodes scales the residuals, so that a step's curvature is of order one on every grid.
+    The root of the number of nodes multiplies the residuals, so the curvature along a step is of order 1 on every grid.
     """
     data, penalties, outcome = problem.evaluate(values)
     return jnp.sqrt(len(values)) * jnp.concatenate([data, penalties]), outcome
@@ -103,7 +103,7 @@ def optimise(
     explained = float(values.dtype.type(-1.0 if noise is None else noise**2 / 2))  # rounded as in `_advance`
     try:
         state = _begin(optimiser, fn, values, problem)
-        # Take one step more than `max_steps`, because many solvers return the result of a step only in the next one.
+        # Take one step more than `max_steps`, because many solvers return the result of a step only in the next step.
         for count in range(max_steps + 2):
             before = values
             sufficient = jnp.asarray(jnp.inf if count >= max_steps else explained, values.dtype)

@@ -22,10 +22,10 @@ from hks_jax.inverse.unknowns import Unknowns, Values
 from hks_jax.signatures.truncation import resolving
 
 _NEAR = 0.1
-"""The share of truncation in a misfit above which a warning is issued, about a third of the residuals."""
+"""The share of the misfit due to truncation above which a warning is issued; its root is about a third."""
 _ENOUGH = 1e-5
-"""The least tolerance of the solver's derivative for which single precision suffices. On 64² nodes single precision
-causes errors of 1e-6 in J and 1e-5 to 3e-5 in Jᵀ; this tolerance causes 5e-6 and 5e-5 for nonsmooth fields."""
+"""The least tolerance of the solver's derivative for which single precision suffices. For the Jacobian J on 64² nodes,
+single precision causes errors of 1e-6 in J and up to 3e-5 in Jᵀ; this tolerance causes errors of 5e-6 and 5e-5."""
 
 
 class Outcome(NamedTuple):
@@ -77,7 +77,7 @@ class Problem(eqx.Module):
 
 
 # A heat signature is at least the contribution of the constant eigenfunctions. Other signatures, and heat signatures
-# without constant eigenfunctions, may underflow in single precision, and derivatives of logarithms divide by them.
+# without constant eigenfunctions, may underflow in single precision, and logarithmic derivatives divide by signatures.
 def _residuals_of(observation: Observation, pairs: Eigenpairs, solver: str | Eigensolver) -> Float[Array, " m"]:
     """Return the residuals, with a derivative in single precision if the solver's derivative is no more accurate."""
     rough = isinstance(solver, Eigensolver) and solver.adjoint.tolerance >= _ENOUGH

@@ -1,6 +1,6 @@
 """Regularisers, which select one of several solutions that explain the data of a fit.
 
-Each penalty is half a weighted mean of squares over the domain, whose residuals enter the least squares problem.
+Each penalty is half a weighted mean of squares over the domain. The least squares problem includes these squares.
 """
 
 from abc import abstractmethod
@@ -29,7 +29,7 @@ class Regulariser(eqx.Module):
         require_number("weight", self.weight, inclusive=True)
 
     def residuals(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, " m"]:
-        """Return the residuals, whose half sum of squares is the penalty."""
+        """Return the residuals; half the sum of their squares is the penalty."""
         deviations = self.deviations(unknowns, values, field)
         return jnp.sqrt(self.weight / int(field.grid.inside.sum())) * deviations.ravel()
 
@@ -85,12 +85,12 @@ class TotalVariation(Regulariser):
             ]
         )
         square = jnp.sum(gradient**2, axis=(0, 1))
-        # This factor is 2(√(s² + ε²) − ε)/s² without cancellation.
+        # The square of this factor is 2(√(s² + ε²) − ε)/s² without cancellation, where s is the gradient's norm.
         return gradient * jnp.sqrt(2 / (jnp.sqrt(square + self.epsilon**2) + self.epsilon))
 
 
 class LogDeterminant(Regulariser):
-    """The penalty ½ weight · mean (log |T| − log |T₀|)², which preserves the area or volume element.
+    """The penalty ½ weight · mean (log |T| − log |T₀|)², which keeps the volume element of T near that of T₀.
 
     Examples:
         >>> scaled = hj.inverse.Free(lambda s: s * field.tensors, jnp.ones(1), field)
@@ -109,7 +109,7 @@ class LogDeterminant(Regulariser):
 
 
 class Prior(Regulariser):
-    """The penalty ½ weight · mean ‖log T − log T₀‖² on the log-Euclidean distance to another field.
+    """The penalty ½ weight · mean ‖log T − log T₀‖² on the log-Euclidean distance of the tensors T to a field T₀.
 
     Examples:
         >>> scaled = hj.inverse.Free(lambda s: s * field.tensors, jnp.ones(1), field)

@@ -35,11 +35,11 @@ class Search:
         tolerance: a fit has converged when the unknowns u change by less than this, relative to 1 + |u| (root mean
             square). Both the last step and the sum of future steps must satisfy this criterion; a geometric series
             predicts future steps. Linear systems of steps that may be the last are solved 30 times more exactly with
-            three times as many products. Directions that the products do not reach are ignored; `identifiability` finds
-            them. Solvers of optimistix test only the last step.
+            three times as many products. Directions that these products do not reach are ignored; `identifiability`
+            finds them. Solvers of optimistix test only the last step.
         max_steps: the maximum number of steps in each stage.
         continuation: the number of stages. The first stage fits only the largest times, the last stage fits all times.
-        starts: the number of starts, first from the initial field, then from random smooth changes. The best is kept.
+        starts: the number of starts, from the initial field and from random smooth changes of it; the best is kept.
         spread: the root mean square of the random changes, in the parameters' units.
         seed: the seed of the random changes.
 
@@ -117,7 +117,7 @@ class Run:
             save(self.path, self.mark, now)
 
     def solve(self, problem: Problem, values: Values, tolerances: float = 1.0, step_size: float = 1.0) -> Reached:
-        """Solve a problem from given unknowns; `tolerances` multiplies the tolerance, `step_size` divides damping."""
+        """Solve a problem from given unknowns; `tolerances` multiplies tolerances, and `step_size` divides damping."""
         method, tolerance = self.search.optimiser, tolerances * self.search.tolerance
         if method == "gauss-newton":
             # Noise requires small steps, because the misfit must not fall far below the noise.

@@ -117,7 +117,7 @@ def unknowns_of(pencil: AnyPencil) -> int:
 def _require_resolved(wanted: int, n_dof: int, what: str, remedy: str) -> None:
     """Warn if more eigenpairs are needed than are accurate; raise ValueError if more than twice as many are needed.
 
-    The margin exists because a fit must be able to start from a metric of more volume, which needs more eigenpairs.
+    The factor 2 is allowed because a fit may start from a metric of more volume, which needs more eigenpairs.
     """
     most = _most_pairs(n_dof)
     if wanted <= most:

@@ -117,7 +117,7 @@ def _zeros(count: Callable[[int], int]) -> Callable[[Tensors], Parameters]:
 
 
 PARAMETRISATIONS = {
-    # The tensors are exp S, LLᵀ, e^u T₀, V diag(e^uᵢ λᵢ) Vᵀ with the eigenvectors V of T₀, and R T₀ Rᵀ.
+    # The tensors are exp S, LLᵀ, e^u T₀, V diag(e^uᵢ λᵢ) Vᵀ and R T₀ Rᵀ, where V and λᵢ belong to T₀ = V diag(λᵢ) Vᵀ.
     "log-euclidean": Parametrisation(_logarithm, _exponential),
     "cholesky": Parametrisation(_cholesky, _from_cholesky),
     "conformal": Parametrisation(_zeros(lambda d: 1), _scaled, smooth=False),

@@ -15,7 +15,7 @@ from hks_jax.storage import load_npy, load_npz, write_npz
 
 
 def _read_image(name: str) -> tuple[np.ndarray, None, str]:
-    """Return the array of an npy, or the array ``mask`` of an npz, without an affine and a unit."""
+    """Return the array of an npy or the array ``mask`` of an npz, None for the affine, and no unit (the empty text)."""
     if name.lower().endswith(".npy"):
         return load_npy(name), None, ""
     arrays = load_npz(name)
@@ -61,7 +61,7 @@ def _read_tensors(
 
 
 def volume_of(name: str, arrays: Mapping[str, Any], tensors: Float[np.ndarray, "..."], **about: Any) -> TensorVolume:
-    """Return a volume of `tensors` at the position in `arrays` (see `place_of`), by default spacing 1 and origin 0."""
+    """Return a volume of `tensors` with the position and mask in `arrays`; by default, spacing is 1 and origin is 0."""
     mask, affine, d = arrays.get("mask"), arrays.get("affine"), tensors.shape[-1] if tensors.ndim else 0
     axis = arrays.get("slice_axis")
     return TensorVolume(
@@ -87,7 +87,7 @@ def _write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, An
 
 
 def place_of(volume: TensorVolume) -> dict[str, Any]:
-    """Return the arrays that define the position of the voxels, and the mask."""
+    """Return, by name, the arrays that define the position of a volume's voxels, and its mask."""
     optional = {"mask": volume.mask, "affine": volume.affine, "slice_axis": volume.slice_axis}
     given = {key: value for key, value in optional.items() if value is not None}
     return {"spacing": volume.spacing, "origin": volume.origin, **given}

@@ -1,8 +1,8 @@
 """Read surfaces in GIFTI and FreeSurfer's format through the optional library nibabel.
 
-A file may have vertices in local coordinates, and a transformation to the scanner's coordinates. FreeSurfer's origin is
-the centre c of a volume with axes x̂, ŷ, ẑ. In its coordinates, these axes are −e₁, −e₃ and e₂, the columns of S
-([systems](https://surfer.nmr.mgh.harvard.edu/fswiki/CoordinateSystems)), so the vertex v is at c + [x̂ ŷ ẑ] Sᵀv.
+FreeSurfer's surface coordinates have their origin at the centre c of a volume with the axes x̂, ŷ and ẑ. In surface
+coordinates, these axes are the vectors −e₁, −e₃ and e₂, which are the columns of the matrix S. So a vertex v has the
+scanner coordinates c + [x̂ ŷ ẑ] Sᵀv ([systems](https://surfer.nmr.mgh.harvard.edu/fswiki/CoordinateSystems)).
 """
 
 import gzip
@@ -41,7 +41,7 @@ def load_freesurfer(path: Path, in_space: bool = False) -> Loaded:
     library = optional("nibabel")
     with reading(path, "a readable FreeSurfer surface"):
         content = path.read_bytes()
-        # The numbers of vertices and triangles follow the magic number and a remark, which end with the second line.
+        # The magic number and a remark end with the second line. The numbers of vertices and triangles follow.
         start = content.index(b"\n", content.index(b"\n", len(_TRIANGLES)) + 1) + 1
         n_vertices, n_faces = np.frombuffer(content[start : start + 8], ">i4").tolist()
         end = start + 8 + 12 * (n_vertices + n_faces)
@@ -62,7 +62,7 @@ def load_freesurfer(path: Path, in_space: bool = False) -> Loaded:
 
 
 def _from_own_axes(path: Path, vertices: np.ndarray, axes: list[np.ndarray]) -> np.ndarray:
-    """Return scanner coordinates, from FreeSurfer's coordinates and its volume's axes x̂, ŷ, ẑ and centre c."""
+    """Transform FreeSurfer's surface coordinates to scanner coordinates; `axes` contains x̂, ŷ, ẑ and the centre c."""
     if any(axis.shape != (3,) or not np.isfinite(axis).all() for axis in axes):
         raise ValueError(
             f"{path}: the file does not state the position of its volume (x_ras … c_ras), which scanner coordinates "
@@ -94,8 +94,8 @@ def load_gifti(path: Path, in_space: bool = False) -> Loaded:
     return Loaded(vertices, faces.astype(np.int64), {})
 
 
-# Workbench declares the coordinates of every file as coordinates of an atlas. With this declaration, or with an unknown
-# space, coordinates stay unchanged, unless FreeSurfer wrote the file in its own coordinates.
+# Workbench declares the coordinates of every file as coordinates of an atlas. Coordinates in an atlas or in an unknown
+# space stay unchanged, unless FreeSurfer wrote the file in its surface coordinates.
 def _in_space(path: Path, vertices: np.ndarray, points: Any) -> np.ndarray:
     """Return scanner coordinates, by the transformation in the file or by the position of FreeSurfer's volume."""
     system, told = points.coordsys, dict(points.meta)

@@ -22,7 +22,7 @@ from hks_jax.storage import existing, reading
 _LENGTH = 0.05
 """The largest difference of a direction's length from 1 that is attributed to rounding."""
 _SEEN = 0.01
-"""A residual is used if the ratio 1 − h of its variance to the variance of the noise is above this value."""
+"""The ratio of a residual's variance to the variance of the noise above which the residual is used."""
 
 
 class ExampleBrain(NamedTuple):
@@ -35,10 +35,10 @@ class ExampleBrain(NamedTuple):
 
 
 def find_example_brain() -> ExampleBrain | None:
-    """Return the files of the brain in the PyPI wheel ``mdt`` (104 × 104 × 2 voxels of 2 mm), or None without it.
+    """Return the files of the brain in the PyPI wheel ``mdt`` (104 × 104 × 2 voxels of 2 mm), or None if it is missing.
 
-    The function reads the wheel's metadata and does not import it. The wheel's version is 1.2.7, its licence
-    LGPL-3.0-or-later; install it with ``--no-deps``. It has 13 images at b = 0, 30 at 1000 and 60 at 2000 s/mm².
+    The scan has 13 images at b = 0, 30 at 1000 and 60 at 2000 s/mm². Install version 1.2.7 of the wheel (licence
+    LGPL-3.0-or-later) with ``--no-deps``. The function reads only the wheel's metadata, without importing the wheel.
 
     Examples:
         >>> brain = hj.io.find_example_brain()
@@ -71,24 +71,24 @@ def fit_dwi(
     Args:
         path: a NIfTI image (nx, ny, nz, n). Voxels with a NaN or infinite signal are left out.
         bval: a text file of the n b-values, in s/mm² unless `unit` is given.
-        bvec: a text file of the n directions of length 1, 3 × n or n × 3. Directions at b = 0 are ignored.
+        bvec: a text file of n directions, 3 × n or n × 3. Directions must have length 1, but are ignored at b = 0.
         mask: a file (see `read_mask`) or a bool array (nx, ny, nz). Tensors outside the mask are zero. If None, DIPY's
             median_otsu finds the brain in the mean of the unweighted images, and a note reports this.
         b_max: the largest b-value used, in s/mm²; None uses all images. A tensor is a model for b ≲ 1000–1500 s/mm².
-        bvec_frame: the axes of the directions. ``"fsl"`` is the convention of dcm2niix and FSL: the voxel axes, the
-            first reversed if the affine's determinant is positive. ``"voxel"`` means the voxel axes. ``"world"`` means
-            the scanner's axes, as in MRtrix.
+        bvec_frame: the axes of the directions. ``"fsl"``, for files of dcm2niix and FSL, means the voxel axes, where
+            the first axis is reversed if the affine's determinant is positive. ``"voxel"`` means the voxel axes.
+            ``"world"`` means the scanner's axes, as in MRtrix.
         unit: a unit of diffusivity whose reciprocal is the unit of the b-values: ``"m2/s"`` for b-values in s/m²,
             ``"um2/ms"`` for ms/µm². None means mm²/s.
         noise: the standard deviation of the images' noise, in the images' unit, from which the tensors' covariance is
             computed. ``"residuals"`` estimates the deviation in each voxel from the residuals of the fit, which have
-            n − 7 degrees of freedom, and also keeps the contribution of each image to the noise, which voxels may share
-            (24 bytes for each voxel and image). If None, no covariance is computed.
+            n − 7 degrees of freedom. The volume then also contains the contribution of each image to the noise
+            (`TensorVolume.modes`, 24 bytes for each voxel and image). If None, no covariance is computed.
 
     Returns:
-        Tensors along the voxel axes, in mm²/s, and with `noise` their noise to first order (`TensorVolume.noise`). DIPY
-        raises eigenvalues that are not positive to about 1e-9 mm²/s, and a note reports the number of such voxels. Most
-        such voxels are at the boundary of the mask, so eroding the mask removes them.
+        Tensors along the voxel axes, in mm²/s. If `noise` is given, the volume also describes the noise of the tensors
+        to first order (`TensorVolume.noise`). DIPY raises eigenvalues that are not positive to about 1e-9 mm²/s, and a
+        note reports the number of such voxels. Most such voxels are at the boundary of the mask; erosion removes them.
 
     Raises:
         ImportError: DIPY or nibabel is missing.
@@ -154,13 +154,13 @@ def fit_dwi(
     return replace(volume, notes=tuple(notes), digest=digest(name))
 
 
-# Let y be the log signals, X the design matrix, and w the signals predicted by an unweighted fit. Weighted least
-# squares minimise Σ w²(y − Xβ)². To first order, a log signal has the variance σ²/w², so β has the covariance
-# σ²(XᵀW²X)⁻¹. The estimate of σ² is the sum of squared residuals of the signals, divided by the number of images minus
-# the number of unknowns (Koay, Chang, Pierpaoli and Basser 2007).
-# The residual rₙ of the signal of image n changes β by (XᵀW²X)⁻¹ Xₙ wₙ rₙ. It has the variance σ²(1 − h), where
-# h = wₙ² Xₙᵀ(XᵀW²X)⁻¹Xₙ, so rₙ/√(1 − h) has the variance of the noise (MacKinnon and White 1985, HC2). Samples of the
-# noise draw one random factor for each image, which preserves correlations of the noise between voxels.
+# Let y be the log signals, X the design matrix, β the unknowns, W the diagonal matrix of signals w that an unweighted
+# fit predicts, and σ² the variance of the noise. Weighted least squares minimise ‖W(y − Xβ)‖². To first order, a log
+# signal has the variance σ²/w², so β has the covariance σ²(XᵀW²X)⁻¹. The estimate of σ² is the sum of squared residuals
+# of the signals, divided by the number of images minus the number of unknowns (Koay, Chang, Pierpaoli and Basser 2007).
+# The residual rₙ of image n changes β by (XᵀW²X)⁻¹ Xₙ wₙ rₙ, where Xₙ is row n of X. This residual has the variance
+# σ²(1 − h) with h = wₙ² Xₙᵀ(XᵀW²X)⁻¹Xₙ, so rₙ/√(1 − h) has the variance of the noise (MacKinnon and White 1985, HC2).
+# A sample of the noise has one random factor for each image, which preserves correlations between voxels.
 def _covariance(
     signal: Float[np.ndarray, "nx ny nz n"],
     inside: Bool[np.ndarray, "nx ny nz"],
@@ -169,9 +169,9 @@ def _covariance(
     frame: str,
     affine: Float[np.ndarray, "4 4"],
 ) -> tuple[Float[np.ndarray, "nx ny nz 6 6"], Float[np.ndarray, "nx ny nz n 6"] | None]:
-    """Return the covariance of the components xx xy yy xz yz zz along the voxel axes, which is zero outside the mask.
+    """Return the covariance of the components xx xy yy xz yz zz along the voxel axes; it is zero outside the mask.
 
-    If `noise` is ``"residuals"``, also return the contribution of each image to their noise; otherwise None.
+    If `noise` is ``"residuals"``, also return the contribution of each image to the components' noise; otherwise None.
     """
     data = np.asarray(signal[inside], np.float64)
     positive = data[data > 0]
@@ -204,7 +204,7 @@ def _covariance(
     covariance[inside] = turned @ (variance[:, None, None] * inverse[:, :6, :6]) @ turned.T
     if noise != "residuals":
         return covariance, None
-    # The fit equals some images exactly, such as a single unweighted image. A random ±σ replaces their residual 0.
+    # The fit reproduces some images exactly, such as a single unweighted image. There, a random ±σ replaces residual 0.
     unseen = np.random.default_rng(0).choice([-1.0, 1.0], data.shape) * np.sqrt(variance)[:, None]
     modes = np.zeros((*inside.shape, len(design), 6), np.float32)
     for i, x in enumerate(design):  # a loop saves memory
@@ -218,7 +218,7 @@ def _covariance(
 def _of_length_one(
     name: str, directions: Float[np.ndarray, "n 3"], weighted: Bool[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 3"], list[str]]:
-    """Return the directions, normalised for weighted images and zero for the others, and a note if any was scaled."""
+    """Return unit directions for weighted images and zero for other images, and a note about lengths other than 1."""
     lengths = np.linalg.norm(directions, axis=1)
     bad = weighted & ~(np.abs(lengths - 1) <= _LENGTH)
     if bad.any():

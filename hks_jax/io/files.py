@@ -44,30 +44,30 @@ def read_tensors(
 
     - NIfTI: an image (nx, ny, nz, 1, 6) or (nx, ny, nz, 6). The symmetric-matrix intent (code 1005) or a BIDS sidecar
       declares the order, and the sidecar may declare the frame. The tensors may also be in six images of one component
-      each; give the path of one of them, or all six.
+      each; pass the path of one image, or the paths of all six.
     - MRtrix: an image (nx, ny, nz, 6), as dwi2tensor writes it.
-    - NRRD: any axis may hold the components. Its kind is one of NRRD's 2D or 3D matrices, or the axis has six
-      components (three in the plane) and `order` is given. The measurement frame is applied. If the file's space is
-      patient-based, the affine's axes are right, anterior, superior.
+    - NRRD: any axis may hold the components. The kind of this axis is one of NRRD's 2D or 3D matrices; otherwise, the
+      axis has six components (three in the plane), and `order` is needed. The measurement frame is applied. If the
+      file's space is patient-based, the affine's axes are right, anterior, superior.
     - VTK (``.vti``, structured points in ``.vtk``): tensors of nine or six components at points or cells, and an
-      optional array ``mask``. An image one voxel thick gives 2×2 tensors if the components across it are zero.
-    - npz: the array ``tensors`` (nx, ny, 2, 2) or (nx, ny, nz, 3, 3), where array axis a runs along coordinate a,
-      or with six components (three in the plane) if `order` is given. Optional arrays are ``spacing`` (d,) = 1,
-      ``origin`` (d,) = 0, ``mask`` (*shape,), ``affine`` (4, 4), ``slice_axis``, ``order`` and ``frame``. npy: only the
-      tensors.
+      optional array ``mask``. An image one voxel thick gives 2×2 tensors if the components across its plane are zero.
+    - npz: the array ``tensors`` (nx, ny, 2, 2) or (nx, ny, nz, 3, 3), where array axis a runs along coordinate a. If
+      `order` is given, the last axis may have six components (three in the plane). Optional arrays are ``spacing``
+      (d,) = 1, ``origin`` (d,) = 0, ``mask`` (*shape,), ``affine`` (4, 4), ``slice_axis``, ``order`` and ``frame``. An
+      npy file has only the tensors.
 
     Args:
         path: the file, or six files.
         order: ``"nifti"`` (xx xy yy xz yz zz), ``"fsl"`` (xx xy xz yy yz zz), ``"mrtrix"`` (xx yy zz xy xz yz) or
             ``"vtk"`` (xx yy zz xy yz xz). None uses the declared order. Omit it for whole matrices.
         mask: a file (see `read_mask`) or a bool array of the volume's shape. None uses the file's mask, if any.
-        frame: the axes of the file's components: ``"voxel"``; ``"fsl"`` (voxel axes, the first reversed if the affine's
-            determinant is positive); ``"world"`` (the axes of the file's space); ``"measurement"`` (NRRD's measurement
+        frame: the axes of the file's components: ``"voxel"``; ``"fsl"`` (voxel axes, where the first is reversed if the
+            affine's determinant is positive); ``"world"`` (the axes of the file's space); ``"measurement"`` (NRRD's
             frame). None uses the declared axes, or else the convention of the order: voxel axes for ``"nifti"``, FSL's
             for ``"fsl"``, and ``"world"`` for ``"mrtrix"`` and ``"vtk"``. NumPy's files use voxel axes.
         array: the name of the tensors' array in an npz or VTK file with several arrays.
         spacing: the spacing for NumPy's files that do not contain it.
-        confidence: in NRRD's masked kinds, a voxel with a larger confidence than this is inside the mask.
+        confidence: the threshold for NRRD's masked kinds. A voxel with a larger confidence is inside the mask.
         repair: the repair of tensors inside the mask that are not positive definite; see `repair_tensors`. If None, the
             tensors stay unchanged, but no metric can be made from them.
         unit: the unit of the tensors, ``"mm2/s"``, ``"um2/ms"`` (10⁻³ mm²/s), ``"um2/s"``, ``"cm2/s"`` or ``"m2/s"``.
@@ -126,15 +126,15 @@ def save(
       an image one voxel thick at its position in space. NaN outside the mask is kept. Times in `extra` are written to
       NAME.json beside the image as ``Times``, following BIDS.
     - ``.nrrd``: the same image with times along the last axis, and `extra` as text in the header.
-    - ``.vti``: point data with one array per time, whose name contains the time, and ``mask``; field data with `extra`.
+    - ``.vti``: point data with ``mask`` and one array per time, whose name contains the time; field data with `extra`.
     - ``.npz``: the values as the array `name`, and the arrays in `extra`. A grid adds ``spacing``, ``origin``, and if
       they exist ``mask``, ``affine`` and ``slice_axis``. A mesh adds ``vertices`` and ``faces`` (triangles) or
       ``cells`` (tetrahedra).
     - ``.vtu``, ``.vtk``, ``.msh`` (Gmsh), and for triangles ``.ply``: the mesh and one array per time.
 
     Every file contains a JSON record of its origin: the version, the tensors' file with its SHA-256, order and frame,
-    the notes about its reading, and `provenance`. For a mesh not in npz, the record is in a second file, whose path is
-    `path` with ``.json`` appended. Files are written atomically.
+    the notes about its reading, and `provenance`. For a mesh, except in npz, the record is in a second file, whose path
+    is `path` with ``.json`` appended. Files are written atomically.
 
     Args:
         path: the file; missing folders are created.
@@ -182,7 +182,7 @@ def save_tensors(
 
     - ``.nii``, ``.nii.gz``: a symmetric-matrix image (nx, ny, nz, 1, 6) with xx xy yy xz yz zz along the voxel axes.
       The tensors are zero outside the mask. Slices cannot be written.
-    - ``.nrrd``: masked symmetric matrices, 3D or 2D, with the measurement frame, without the position of a slice.
+    - ``.nrrd``: masked symmetric matrices, 3D or 2D, and the measurement frame, but not the position of a slice.
     - ``.vti``: nine components at the points, along the axes of space, and the mask. A slice gets zeros for the
       components across its plane.
     - ``.npz``: the arrays that `read_tensors` documents.

@@ -50,7 +50,7 @@ def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) ->
 def mask_on(
     shape: tuple[int, ...], affine: np.ndarray | None, mask: str | os.PathLike[str] | np.ndarray
 ) -> Bool[np.ndarray, "*shape"]:
-    """Return a mask, from a file or an array, for an image of this shape; raise ValueError for another shape."""
+    """Return the mask in a file or an array; raise ValueError unless the mask has the shape of the image."""
     inside = as_mask("mask", mask) if isinstance(mask, np.ndarray) else read_mask(mask, affine)
     if inside.shape != shape:
         raise ValueError(f"mask: got shape {inside.shape}; expected the shape of the image, {shape}")
@@ -81,7 +81,7 @@ def erode(mask: Bool[np.ndarray, "*shape"], iterations: int = 1) -> Bool[np.ndar
 
 
 def read_labels(path: str | os.PathLike[str], on: TensorVolume | SimplicialMesh) -> Integer[np.ndarray, "*shape"]:
-    """Read integer labels (0 means unlabelled) at the voxels of an image or vertices of a mesh, in NIfTI or ``.npy``.
+    """Read integer labels at the voxels of an image or the vertices of a mesh from NIfTI or ``.npy``; 0: unlabelled.
 
     If the labels and the image have affines, their voxels must coincide. For a slice, the file may have the labels of
     the whole volume, or of the slice in two dimensions. Otherwise, the labels must have the shape of the image.
@@ -90,7 +90,7 @@ def read_labels(path: str | os.PathLike[str], on: TensorVolume | SimplicialMesh)
     name = os.fspath(path)
     values, place = _image(name, affine, (*nifti.SUFFIXES, ".npy"))
     if isinstance(on, TensorVolume) and affine is not None and place is not None and values.ndim in (2, 3):
-        if values.ndim == 2:  # the file's two axes are those of the slice
+        if values.ndim == 2:  # the file's two axes are the axes of the slice
             values = np.expand_dims(values, on.thin_axis)
             place = np.insert(np.delete(place, 2, axis=1), on.thin_axis, place[:, 2], axis=1)
         values = _at_voxels(name, values, np.linalg.solve(place, affine), on)
@@ -128,7 +128,7 @@ def names_beside(path: str | os.PathLike[str]) -> str | None:
 
 
 def _image(name: str, affine: np.ndarray | None, suffixes: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the voxel values, without trailing axes of length one, and the affine or None; `affine` is the image's."""
+    """Return a file's values without trailing axes of length one, and its affine or None; `affine` is the image's."""
     read = format_of(name, suffixes).read_image
     assert read is not None
     values, place, unit = read(name)

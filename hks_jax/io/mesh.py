@@ -49,9 +49,9 @@ def read_mesh(path: str | os.PathLike[str], *, clean: bool = False, in_space: bo
             within 1e-8 of the mesh's size, flips the longest edge of triangles of nearly zero height, removes cells of
             zero area or volume, duplicate cells and unused vertices, and reverses tetrahedra of negative orientation.
             The remaining vertices are renumbered in the order of the file, and a warning lists the changes.
-        in_space: whether to return scanner coordinates, as images have. FreeSurfer's coordinates are transformed by the
-            axes and the centre of its volume (c_ras), GIFTI's by the transformation in the file. Other formats are
-            unchanged.
+        in_space: whether to return the scanner coordinates that images have. FreeSurfer's coordinates are transformed
+            by the axes and the centre (c_ras) of its volume, and GIFTI's coordinates by the transformation in the file.
+            Coordinates in other formats stay unchanged.
 
     Raises:
         FileNotFoundError: the file does not exist.
@@ -172,7 +172,7 @@ def _same_places(vertices: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, " V"]:
 
 
 def _require_joined(loaded: Loaded) -> str:
-    """Return a warning if vertices coincide, as at seams, or the empty text; raise ValueError if pieces touch there."""
+    """Return a warning if vertices coincide, or else the empty text; raise ValueError if pieces of the mesh touch."""
     first = _same_places(loaded.vertices)
     doubled = int((first != np.arange(len(first))).sum())
     if not doubled:
@@ -226,7 +226,7 @@ def _cleaned(loaded: Loaded) -> tuple[Loaded, str]:
 def _without_thin(
     vertices: Float[np.ndarray, "V 3"], cells: Int[np.ndarray, "n 3"]
 ) -> tuple[Int[np.ndarray, "m 3"], int]:
-    """Flip the longest edge of triangles of nearly zero height, or remove them at a boundary; also count the flips."""
+    """Flip the longest edge of each triangle of nearly zero height, or remove such a triangle at a boundary."""
     cells, gone, flipped = cells.copy(), np.zeros(len(cells), bool), 0
     corners = vertices[cells]
     lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)

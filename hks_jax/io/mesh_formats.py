@@ -1,6 +1,6 @@
 """Read meshes through meshio, polygonal data through VTK, and variants of OBJ and OFF that meshio does not support.
 
-In a damaged file, meshio may omit cells or read a wrong number of points without an error, so this module checks both.
+In a damaged file, meshio may omit points or cells without an error, so this module checks their numbers.
 """
 
 import re
@@ -60,10 +60,10 @@ _COUNTS = {
     ".vtk": (rb"\bPOINTS\s+(-?\d+)", rb"\bCELL_TYPES\s+(-?\d+)"),
     ".vtu": (rb"NumberOfPoints\s*=\s*[\"'](-?\d+)", rb"NumberOfCells\s*=\s*[\"'](-?\d+)"),
 }
-"""Patterns of the declared numbers of points and cells in each format. For .stl, meshio compares the length itself."""
+"""Patterns of the declared numbers of points and cells in each format. For .stl, meshio checks the file's length."""
 
 _PLY = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
-"""The size in bytes of those types in .ply that have another name in NumPy."""
+"""The size in bytes of each type in .ply that has another name in NumPy."""
 
 
 def _declared(content: bytes, suffix: str) -> tuple[int, ...]:
@@ -78,7 +78,7 @@ def _declared(content: bytes, suffix: str) -> tuple[int, ...]:
 
 
 def _compare(content: bytes, suffix: str, declared: tuple[int, ...], mesh: Any) -> None:
-    """Raise ValueError unless meshio found the declared numbers of points and cells, and nothing follows them."""
+    """Raise ValueError unless the points, the cells and, in .vtk and .ply, the length of their data are as declared."""
     counts = (len(mesh.points), sum(len(block.data) for block in mesh.cells))
     if declared and declared[:2] != counts:
         what = "the file declares {} points and {} cells, but has {} and {}"
@@ -172,10 +172,10 @@ def fans(
     polygons: Int[np.ndarray, "n corners"],
     numbers: Int[np.ndarray, " n"] | None = None,
 ) -> Int[np.ndarray, "n m 3"]:
-    """Cut polygons into triangles that share the first corner from which all others are visible.
+    """Cut each polygon into triangles that share its first corner from which all other corners are visible.
 
     Raises:
-        ValueError: a vertex does not exist, or a polygon has no such corner. The message gives its entry in `numbers`.
+        ValueError: a vertex does not exist, or a polygon, whose number is in `numbers`, has no such corner.
     """
     if polygons.ndim != 2 or polygons.shape[1] < 3:
         raise ValueError(f"{file}: got faces of shape {polygons.shape}; expected at least 3 corners each")
@@ -236,7 +236,7 @@ def load_off(file: Path) -> Loaded:
         keyword = _KEYWORD.match(lines[0]) if lines else None
         if keyword is None:
             raise ValueError("the file does not begin with OFF, COFF, NOFF or STOFF")
-        # The numbers of vertices and faces follow on the same line, even without a space, or on the next line.
+        # The numbers of vertices and faces follow the keyword on the same line, even without a space, or on the next.
         head, *rest = filter(None, (lines[0][keyword.end() :].strip(), *lines[1:]))
         n_vertices, n_faces = (int(word) for word in head.split()[:2])
         if min(n_vertices, n_faces) < 0 or len(rest) != n_vertices + n_faces:

@@ -19,7 +19,7 @@ _KINDS = {"Int": "i", "UInt": "u", "Float": "f"}
 
 
 def _load(name: str) -> tuple[np.ndarray, Float[np.ndarray, "4 4"], str]:
-    """Return the voxel values, with axes in the header's sequence, the affine to scanner coordinates, and the unit."""
+    """Return the voxel values (axes as in the header), the affine to scanner coordinates, and the unit of length."""
     file = existing(name)
     with reading(file, "a readable MRtrix image (.mif)"):
         content = gzip.decompress(file.read_bytes()) if file.name.lower().endswith(".gz") else file.read_bytes()

@@ -56,7 +56,7 @@ def load(name: str) -> Any:
 
 
 def voxels(name: str, image: Any) -> np.ndarray:
-    """Return the voxel values of a loaded image after its scaling, in float32 if they are stored so, or in float64."""
+    """Return the scaled voxel values of a loaded image, in float32 if nibabel returns float32, otherwise in float64."""
     with reading(name, "a readable NIfTI image"):
         data = np.asarray(image.dataobj)
     if data.dtype.kind not in "fiub":
@@ -66,7 +66,7 @@ def voxels(name: str, image: Any) -> np.ndarray:
 
 
 def affine_in_mm(name: str, image: Any) -> tuple[np.ndarray, str]:
-    """Return the affine with lengths in mm, and the unit of length that the file declares, or the empty text."""
+    """Return the affine with lengths in mm, and the unit of length that the file declares (empty if it has none)."""
     code = int(image.header["xyzt_units"]) & 7
     if code not in _LENGTHS:
         raise ValueError(f"{name}: got the code {code} for the unit of length; expected 0 to 3. Correct xyzt_units")

@@ -23,7 +23,7 @@ KINDS = {
     for masked in ("", "masked-")
     for symmetric in ("", "symmetric-")
 }
-"""For each kind of axis that contains the components of a tensor, the number of its entries, with any confidence."""
+"""The number of entries along an axis of tensor components, by kind of axis; masked kinds also have a confidence."""
 
 _FIELDS = (
     "dimension, type, block size, blocksize, encoding, endian, content, min, max, old min, oldmin, old max, oldmax, "
@@ -123,7 +123,7 @@ def _space_of(header: Mapping[str, Any]) -> str:
 
 
 def _check_data(file: Path, header: Mapping[str, Any], start: int) -> None:
-    """Raise an error if compressed data are incomplete or fail their checksum; pynrrd checks uncompressed ones."""
+    """Raise an error if compressed data are incomplete or fail their checksum; pynrrd checks uncompressed data."""
     opened = _OPENED.get(str(header["encoding"]).lower())
     if opened is None:
         return
@@ -205,10 +205,10 @@ def _write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, An
 
 
 def _store(path: Path, array: np.ndarray, volume: TensorVolume, record: str, kind: str, more: dict[str, Any]) -> None:
-    """Write an array over the voxels of a volume, with the axes right, anterior, superior if there is an affine.
+    """Write an array over the voxels of a volume; if it has an affine, the space is right, anterior, superior.
 
-    The array has tensor components of the kind `kind` along the first axis, or times along the last. A slice with an
-    affine must be one voxel thick. The header receives the arrays in `more` as text.
+    If `kind` is not empty, the first axis of the array has tensor components of this kind; otherwise, the last axis may
+    have times. A slice with an affine must be one voxel thick. The header receives the arrays in `more` as text.
     """
     nrrd = optional("nrrd")
     placed = volume.affine is not None and not kind.startswith("2D")

@@ -16,13 +16,13 @@ from hks_jax.storage import load_npz, write_npz
 ARRAYS = tuple(f.name for f in fields(Eigenpairs) if f.name not in ("frame", "pencil", "solver_name"))
 """The fields of `hks_jax.Eigenpairs` that are saved as arrays, without `frame`, which equals `vectors`."""
 _FAR = 1e-3
-"""The residual, relative to the next eigenvalue, above which pairs count as belonging to another pencil."""
+"""The residual, relative to the largest known eigenvalue, above which pairs count as pairs of another pencil."""
 
 
 def save_pairs(path: str | os.PathLike[str], pairs: Eigenpairs, extra: Mapping[str, Any] | None = None) -> Path:
-    """Write eigenpairs to an uncompressed npz for `load_pairs`, about k numbers for each degree of freedom.
+    """Write k eigenpairs for `load_pairs` to an uncompressed npz, which has about k numbers per degree of freedom.
 
-    The matrices are not written. To assemble them again, keep the tensors and the mask, or pass them as `extra`.
+    The pencil is not written. To assemble the pencil again, keep the tensors and the mask, or pass both as `extra`.
 
     Args:
         path: the file, ``.npz``, which is written atomically; missing folders are created.

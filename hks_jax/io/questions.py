@@ -83,9 +83,9 @@ class Coherence(NamedTuple):
 def coherence(volume: TensorVolume) -> Coherence | None:
     """Measure how well fibres of neighbouring voxels line up, in the frame of the file and along alternative axes.
 
-    At an anisotropic voxel, the principal direction v is compared with the mean of the directions at the neighbours
-    nearest to ±v, if both are anisotropic. The angle is smallest in the correct frame. Alternatives are the frames of
-    `read_tensors` and reversals of an axis. The result is None for a slice, and for fewer than 1000 such voxels.
+    The principal direction v at an anisotropic voxel is compared with the mean direction at its two neighbours along
+    ±v, if both are anisotropic. The angle between v and this mean is least in the correct frame. Alternative axes are
+    the frames of `read_tensors` and reversals. The result is None for a slice, or for fewer than 1000 such angles.
     """
     if volume.dimension != 3:
         return None
@@ -132,8 +132,8 @@ def _angles(
 ) -> Float[np.ndarray, " n"]:
     """Return the angle, in degrees, between each direction and the mean direction of its two neighbours, or NaN.
 
-    Along a curved fibre, the directions at the two neighbours deviate to opposite sides, and the mean cancels this. A
-    single neighbour would not suffice: circular fibres around a heart would then seem to line up best along radii.
+    Along a curved fibre, the directions at the two neighbours deviate to opposite sides, and the deviations cancel in
+    the mean. With a single neighbour, circular fibres around a heart would seem to line up best along radii.
     """
     steps = directions / spacing
     steps = np.rint(steps / np.abs(steps).max(axis=1, keepdims=True)).astype(int)
@@ -177,8 +177,8 @@ def questions(volume: TensorVolume) -> tuple[str, ...]:
     """Check tensors for a wrong frame or unit; return questions such as "Wrong unit?", each with a remedy.
 
     Reflected or rotated tensors are still positive definite, but fibres of neighbouring voxels do not line up. The
-    function therefore computes the mean angle between a principal direction and those of the two neighbours along it,
-    and compares the angle for several frames. The comparison needs about 1000 anisotropic voxels; set the mask first.
+    function therefore computes the mean angle between the principal directions at a voxel and at its neighbours along
+    the fibre, and compares the angles for several frames. It needs about 1000 anisotropic voxels; set the mask first.
 
     If lengths are in mm, the function also checks that the size of the voxels is usual for scans, and that the median
     mean diffusivity occurs in living tissue. For a slice, only the units are checked.

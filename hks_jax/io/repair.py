@@ -79,15 +79,15 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
             programs write the background as zero.
         method: the treatment of tensors that are not positive definite or have an eigenvalue below `floor`. ``"clip"``
             raises their eigenvalues to the floor, which gives the nearest admissible tensor in the Frobenius norm.
-            ``"mask"`` removes their voxels from the mask. ``"nearest"`` replaces each by the tensor of the nearest
-            valid voxel in space.
+            ``"mask"`` removes their voxels from the mask. ``"nearest"`` replaces each of these tensors by the tensor
+            of the nearest valid voxel in space.
         floor: the least admissible eigenvalue, in the tensors' unit. If None, all positive eigenvalues are admissible,
             and ``"clip"`` uses 1 % of the median of the valid tensors' mean eigenvalues.
 
     Returns:
         The volume. Its ``repair`` contains the method, the floor, the number of repaired voxels and of all voxels, the
-        number of tensors that are not finite, the worst eigenvalue, a bounding box and the first indices. A note
-        summarises this.
+        number of tensors that are not finite, the worst eigenvalue, and the bounding box and first indices of the
+        repaired voxels. A note summarises the repair.
 
     Raises:
         ValueError: the method is unknown, the floor is not positive, no tensor is valid, or a tensor is NaN or infinite
@@ -160,7 +160,7 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
 
 
 def _why_so_many(volume: TensorVolume, finite: Float[np.ndarray, "n d d"]) -> str:
-    """Return a possible reason for many invalid tensors, such as a wrong order; `finite` has the finite ones."""
+    """Return a possible reason for many invalid tensors, such as a wrong order; `finite` has those that are finite."""
     question = "" if volume.invalid_by_order is None else volume.invalid_by_order.question
     if question or not len(finite):
         return question or "Noise does not explain this number. Programs often write NaN outside a mask"
@@ -221,14 +221,14 @@ def find_background(volume: TensorVolume) -> tuple[Bool[np.ndarray, "*shape"], s
 
 
 def positive_tensors(volume: TensorVolume, how: PositiveMap, number: float) -> TensorVolume:
-    """Map all tensors S inside the mask, such as stresses, to positive definite ones, and return the volume.
+    """Map all tensors S inside the mask, such as stresses, to positive definite tensors, and return the volume.
 
     ``"exp"`` computes exp(S/number), and ``"shift"`` computes S + number·I, as `hks_jax.TensorField.from_indefinite`
     does. The mapped tensors are a metric, so continue with ``metric="tensor"``.
 
     Returns:
         The volume. Its ``repair`` contains the map, its number, the number of tensors that were not positive definite,
-        and the number of all tensors. A note summarises this.
+        and the number of all tensors. A note summarises the map.
 
     Raises:
         ValueError: the map is unknown; a tensor is NaN, infinite or unsymmetric; the scale or shift is too small.

@@ -34,7 +34,7 @@ class Result:
         eigenvalues: (k,), or (0,) if they are unknown.
         report: facts about the computation; the entry ``settings`` contains its settings.
         arrays: more named arrays, saved with the result: ``deviation``, ``bias`` and ``noise_maps`` (n_draws, n_times,
-            *shape) for error bars, the products ``scaled_times`` of λ₁ and t, and ``input_tensors`` if known.
+            *shape) for error bars, ``scaled_times`` (t times the first positive eigenvalue), and ``input_tensors``.
         name: ``"hks"`` or ``"curvature"``.
         source: the file from which the result was read.
 
@@ -171,7 +171,7 @@ class Result:
 
     @property
     def lengths(self) -> Float[np.ndarray, " n_times"] | None:
-        """(n_times,) the distances √(Dt) for the median mean diffusivity D in the domain, for the metric D⁻¹."""
+        """(n_times,) the distances √(Dt), where D is the median mean diffusivity; None if the metric is not D⁻¹."""
         if self.tensors is None or self.settings.get("metric") != "inverse":
             return None
         diffusivity = median_mean_diffusivity(self.volume.with_mask(np.isfinite(self.values[0])))
@@ -179,7 +179,7 @@ class Result:
 
     @property
     def z(self) -> Float[np.ndarray, "n_times *shape"] | None:
-        """The difference from flat space (raw, flat) or the median (other normalisations), in standard deviations."""
+        """The values minus the value of flat space (raw, flat) or their median, divided by the standard deviation."""
         if "deviation" not in self.arrays:
             return None
         flat = {"raw": 1 / self.flat_scale, "flat": 1.0}
@@ -216,7 +216,7 @@ def tuples(value: Any) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """Return a value with None for NaN and infinity, and without tuples, paths or NumPy scalars, for JSON."""
+    """Convert a value for JSON: NaN and infinity become None; tuples, paths and NumPy scalars become plain values."""
     if isinstance(value, Mapping):
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

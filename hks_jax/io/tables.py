@@ -17,7 +17,7 @@ def write_table(
 ) -> list[Path]:
     """Write a table and, if `about` is given, a JSON file beside it; return the paths.
 
-    Both files are written atomically, the JSON file last, so if the JSON file exists, the table does.
+    Both files are written atomically. The JSON file is written last, so if it exists, the table exists too.
     """
     written = [path]
     with atomic_path(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as stream:
@@ -29,7 +29,7 @@ def write_table(
 
 
 def cell(value: Any) -> str:
-    """Return a value as text without tabs: a number with nine digits, None, NaN, infinity and ``""`` as ``n/a``."""
+    """Return a value as text without tabs. Floats have nine digits; None, NaN, infinity and ``""`` become ``n/a``."""
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return MISSING
     return f"{value:.9g}" if isinstance(value, float) else " ".join(str(value).split()) or MISSING
@@ -43,7 +43,7 @@ def write_json(path: Path, content: Mapping[str, Any]) -> Path:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return the object in a JSON file; an empty one if the file is missing, invalid or contains no object."""
+    """Return the object in a JSON file, or an empty object if the file is missing, invalid or contains no object."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -1,8 +1,8 @@
 """The orders in which programs store the components of a symmetric tensor, and the axes of the components.
 
-The same numbers represent different tensors in programs that differ in the order or the axes. The three components of
-a 2×2 tensor have the same sequence as among the six of a 3×3 tensor. NRRD's kinds of matrix have the order
-xx xy xz yy yz zz, along the axes of the measurement frame.
+The same numbers represent different tensors in programs that differ in the order or the axes. In each order, the
+components xx, xy and yy of a 2×2 tensor have the same sequence as in a 3×3 tensor. NRRD's kinds of matrix have the
+order xx xy xz yy yz zz, along the axes of the measurement frame.
 """
 
 import math
@@ -49,8 +49,8 @@ def to_voxel_axes(
     """Transform the components of tensors from the axes of `frame` to the voxel axes.
 
     The matrix `affine` (or its linear part) maps voxel indices to world coordinates. ``"voxel"`` changes nothing.
-    ``"fsl"`` reverses the first axis if det(affine) > 0. ``"world"`` gives D_voxel = RᵀDR, where R is the rotation or
-    reflection nearest to the affine.
+    ``"fsl"`` reverses the first axis if det(affine) > 0. ``"world"`` transforms a tensor D to RᵀDR, where R is the
+    rotation or reflection nearest to the affine.
     """
     if frame == "voxel":
         return tensors
@@ -146,7 +146,7 @@ def matrices(name: str, components: Float[np.ndarray, "*shape n"], order: str | 
     """Return tensors from all d² entries of matrices, or from the d(d+1)/2 components of symmetric matrices.
 
     Raises:
-        ValueError: the order is unknown, or given for whole matrices, or missing (also in `declared`) for components.
+        ValueError: the order is unknown; an order is given for whole matrices; or no order is given or declared.
     """
     n = components.shape[-1]
     if n in (4, 9):

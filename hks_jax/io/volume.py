@@ -1,4 +1,4 @@
-"""The class of tensor fields from files, with their position in space and their origin, and the class of formats."""
+"""The class of tensor fields from files, with their position in space and their source, and the class of formats."""
 
 import hashlib
 import json
@@ -34,7 +34,7 @@ class Format:
     # Writes results; called with a path, an array, the volume, the array's name, more arrays and the provenance.
     write: Callable[[Path, np.ndarray, "TensorVolume", str, dict[str, Any], str], None] | None = None
     write_tensors: Callable[[Path, "TensorVolume", Mapping[str, Any] | None], None] | None = None
-    image: str = ""  # the suffix of images of results, for tensors in this format; empty if results are only npz
+    image: str = ""  # the suffix of images of results, if tensors have this format; empty if results are only npz
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class TensorVolume:
         mask: bool (*shape), or None for all voxels.
         affine: (4, 4), the map from voxel indices to world coordinates, or None. A slice has the affine of a volume one
             voxel thick.
-        slice_axis: for a slice, the axis of the volume perpendicular to it; None for a volume.
+        slice_axis: for a slice, the volume's axis perpendicular to the slice; None for a volume.
         order: the order of components in the file, or ``"matrix"`` for whole matrices.
         frame: the axes of the components in the file.
         notes: sentences about decisions made while the file was read.
@@ -149,8 +149,8 @@ class TensorVolume:
     def slice(self, axis: int | str, index: int) -> "TensorVolume":
         """Return the slice at an index along an axis (0, 1, 2 or ``"x"``, ``"y"``, ``"z"``) as a volume with d = 2.
 
-        The slice has the in-plane 2×2 block of each tensor. For a diffusion tensor D this describes diffusion confined
-        to the slice with the measured in-plane diffusivities, and gives the metric g = (block of D)⁻¹. The block of D⁻¹
+        The slice has the in-plane 2×2 block of each tensor. The block of a diffusion tensor D describes diffusion in
+        the slice with the measured in-plane diffusivities, and gives the metric g = (block of D)⁻¹. The block of D⁻¹
         would instead be the metric induced on the slice as a surface in the volume. The two metrics differ if a
         principal axis is oblique to the slice.
 

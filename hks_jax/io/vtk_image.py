@@ -23,7 +23,7 @@ from hks_jax.storage import atomic_path, existing, load_npz, reading
 _ROOM, _RATIO = 8 << 30, 200
 """The limit of memory for reading an empty file, in bytes, and the increase of the limit per byte of a file."""
 _PATIENCE, _SPEED = 60.0, 1e6
-"""The limit of time for reading an empty file, in seconds, and the number of bytes that increase it by 1 s."""
+"""The limit of time for reading an empty file, in seconds, and the number of bytes that increase the limit by 1 s."""
 
 
 def holds_dataset(path: str | os.PathLike[str], kind: str) -> bool:
@@ -103,7 +103,7 @@ def _write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, An
 
 
 def by_time(name: str, array: np.ndarray, n: int, extra: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return the array by its name if n = 0, or one array per time, with the time in its name, if n = 1."""
+    """Return the array by name if n = 0; if n = 1, return one array per time, whose name contains the time."""
     if n == 0:
         return {name: array}
     times = np.ravel(extra.get("times", ()))
@@ -112,7 +112,7 @@ def by_time(name: str, array: np.ndarray, n: int, extra: Mapping[str, Any]) -> d
 
 
 def _store(path: Path, arrays: dict[str, np.ndarray], volume: TensorVolume, record: str, more: dict[str, Any]) -> None:
-    """Write point data, with (*shape, 3, 3) as tensors, and the mask; write `more` and the record as field data."""
+    """Write the arrays and the mask as point data (matrices as tensors), and `more` and the record as field data."""
     optional("vtkmodules.vtkIOXML")
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkCommonCore import vtkStringArray
@@ -154,7 +154,7 @@ def _store(path: Path, arrays: dict[str, np.ndarray], volume: TensorVolume, reco
 
 
 def _check_pieces(content: bytes) -> None:
-    """Raise ValueError unless the pieces of an image fill its whole extent; VTK would invent the missing values."""
+    """Raise ValueError unless the pieces of an image fill its whole extent; VTK would not report missing values."""
     head = content.partition(b"<AppendedData")[0]
 
     def cells(extent: bytes) -> int:
@@ -171,7 +171,7 @@ def _check_pieces(content: bytes) -> None:
 
 
 def _check_range(content: bytes, array: str, values: np.ndarray) -> None:
-    """Raise ValueError if the file declares a range of the array that its values and its rows' norms do not have."""
+    """Raise ValueError unless the array's values, or the norms of its rows, have the range that the file declares."""
     tag = re.search(rb"<DataArray\b[^>]*\bName=\"" + re.escape(array.encode()) + rb"\"[^>]*>", content)
     told = [float(word) for word in re.findall(rb"\bRangeM(?:in|ax)=\"([^\"]+)\"", tag[0])] if tag else []
     if len(told) < 2 or np.isnan(values).any() or b"vtkGhostType" in content[:10_000]:  # the range omits ghost values

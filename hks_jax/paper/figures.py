@@ -149,7 +149,7 @@ def _row(panels: np.ndarray, field: TensorField, name: str) -> None:
 
 
 def figure3(full: bool, echo: Callable[[str], None]) -> Figure:
-    """Return Figure 3, with four fields of diagonal tensors and their HKS."""
+    """Return Figure 3, which shows four fields of diagonal tensors and their HKS."""
     n, time = SIZES["figure3"][full], TIMES["figure3"]
     fields, images = list(figure3_fields(n).values()), []
     for number, field in enumerate(fields, 1):
@@ -170,9 +170,9 @@ def figure3(full: bool, echo: Callable[[str], None]) -> Figure:
 
 
 def figure4(full: bool, echo: Callable[[str], None]) -> Figure:
-    """Return Figure 4, with constant eigenvalues and varying eigenvectors, where the HKS depends on how lines bend."""
+    """Return Figure 4, which shows fields of constant eigenvalues and varying eigenvectors, and their HKS."""
     n, time = SIZES["figure4"][full], TIMES["figure4"]
-    strip = 0.28  # heat decays to exp(−strip²/t) = exp(−8); the centre of circles and spirals is further out
+    strip = 0.28  # heat decays to exp(−strip²/t) = exp(−8); the centres of circles and spirals are beyond the strip
     fields = figure4_fields(n)
     fig = plot.new_figure(3.6 * len(fields) + 0.6, 7.2)
     tops, bottoms = fig.subplots(2, len(fields), sharex=True, sharey=True)
@@ -192,7 +192,7 @@ def figure4(full: bool, echo: Callable[[str], None]) -> Figure:
 
 
 def figure5(full: bool, echo: Callable[[str], None]) -> Figure:
-    """Return Figure 5, with isolated degenerate points of index −2 to 3."""
+    """Return Figure 5, which shows the HKS around isolated degenerate points of index −2 to 3."""
     n, time = SIZES["figure5"][full], TIMES["figure5"]
     strip = 0.7  # at least 1.6 in metric length, where heat decays to at most exp(−1.6²/t)
     fields, images = [degenerate_point_field(float(index), n) for index in INDICES], []
@@ -246,7 +246,7 @@ def figure6(full: bool, echo: Callable[[str], None]) -> Figure:
         echo(f"{name}, {label}, {int(grid.inside.sum())} nodes, {k} eigenpairs")
         values = signature(field, times, k)
         for ax, image, t, length in zip(row[1:], values, times, LENGTHS, strict=True):
-            # The Neumann boundary raises the HKS near it up to fourfold, so the values in the tissue set the colours.
+            # The Neumann boundary raises the HKS near it up to fourfold, so values away from it determine the colours.
             tissue = depth > min(2 * length, 0.3 * depth.max())
             low, high = np.quantile(image[tissue], (0.01, 0.99)).tolist()
             plot.scalar_image(ax, image, grid, cmap=colours, vmin=low, vmax=high, orientation=orientation)

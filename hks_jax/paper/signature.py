@@ -39,7 +39,7 @@ def signature(
 def enough_pairs(field: TensorField, time: float, boundary: str = "neumann", exponent: float = 8.0) -> int:
     """Return k such that exp(−λₖt) is about exp(−exponent), by Weyl's law for a square.
 
-    The mirrored square has four times the area and no boundary.
+    For the boundary condition "mirror", the mirrored square has four times the area and no boundary.
     """
     density = np.sqrt(np.linalg.det(np.asarray(field.domain_tensors)))
     area = float(np.sum(density[field.grid.inside]) * np.prod(field.grid.spacing))
@@ -52,7 +52,7 @@ def flat_signature(
 ) -> Float[np.ndarray, "*shape"]:
     """Return 4πt·HKS, which is 1 where a metric is flat and its boundary is far.
 
-    The whole spectrum is used on small grids, and eigenpairs up to exp(−λₖt) ≈ exp(−exponent) on large grids.
+    On small grids, the HKS is computed from the whole spectrum; on large grids, from the pairs of `enough_pairs`.
     """
     if math.prod(field.grid.shape) > SMALL:
         return signature(field, [time], enough_pairs(field, time, boundary, exponent), boundary, "flat")[0]

@@ -1,6 +1,6 @@
 """Violations of the triangle inequality by edge lengths in the metric, a remark of the paper.
 
-The remark concerns discrete exterior calculus. Diagonals cut cells into triangles; `LENGTHS` has rules for lengths.
+The remark concerns discrete exterior calculus. Diagonals cut the cells of a grid into triangles.
 """
 
 from collections.abc import Callable
@@ -38,7 +38,7 @@ LENGTHS: dict[str, Callable[[Tensors, Tensors, Vectors], Float[np.ndarray, " n"]
     "mean of the ends": lambda a, b, edges: (_norm(a, edges) + _norm(b, edges)) / 2,
     "integrated": _integrated,
 }
-"""The length of an edge from the tensors at its ends, which are interpolated linearly in between."""
+"""Rules for the length of an edge from the tensors at its two ends; tensors in between are interpolated linearly."""
 
 
 class Count(NamedTuple):

@@ -19,7 +19,7 @@ PIXELS_PER_INCH = 110
 """The texture's resolution, at which single grains are visible in print and on screens."""
 
 FRAME = 3
-"""The width of the border around the arrays of pixels, which exceeds the length of a step."""
+"""The width in pixels of the border around the arrays of pixels; it exceeds the length of a step."""
 
 
 def lic_texture(
@@ -97,7 +97,7 @@ def line_integral_convolution(
 ) -> AxesImage:
     """Shade an image by the line integral convolution of an eigenvector field.
 
-    The texture darkens and lightens colours equally, so on average they agree with the colour bar.
+    The texture darkens and lightens colours equally, so on average the colours agree with the colour bar.
 
     Args:
         ax: the axes to draw on.

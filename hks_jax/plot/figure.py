@@ -24,7 +24,7 @@ LABELS = 21
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure, with sizes in inches, that arranges its axes without overlaps.
+    """Return an empty figure of the given size in inches, which arranges its axes without overlaps.
 
     Examples:
         >>> hj.plot.new_figure(4, 3).get_size_inches()

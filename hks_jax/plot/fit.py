@@ -23,7 +23,7 @@ if TYPE_CHECKING:  # slow to import
     from hks_jax.inverse.metric_fit import MetricFit
 
 LEAST_DIFFERENCE = 1e-6
-"""The minimum of the colours' range for relative differences; the errors of the eigenpairs are smaller."""
+"""The least range of the colours of relative differences; differences due to errors of eigenpairs are smaller."""
 
 
 def fit_panels(
@@ -44,7 +44,7 @@ def fit_panels(
     Args:
         fit: the result of `hks_jax.fit_metric`.
         target: (n_times, *grid.shape) the target of the fit; NaN at unobserved entries.
-        times: (n_times,) times or energies, by default the fit's.
+        times: (n_times,) times or energies, by default those of the fit.
         max_times: the maximum number of rows with times.
         title: the figure's title.
         orientation: the orientation of the grid in space, as for `scalar_image`.

@@ -19,7 +19,7 @@ from hks_jax.domain.tensor_field import TensorField
 from hks_jax.plot.figure import cell_extent, colour_bar, frame, legend_below, require_plane, side_in_inches
 
 FILL = 0.92
-"""The size of the largest ellipse or cross relative to its cell; at most 1, because larger ones overlap."""
+"""The size of the largest ellipse or cross relative to its cell; at most 1, because larger glyphs overlap."""
 
 
 def ellipses(
@@ -142,8 +142,8 @@ def sensitivity(
 ) -> LineCollection:
     """Draw the derivative of a number with respect to the tensors at each node as a cross.
 
-    A cross has two bars along the eigenvectors of the gradient with lengths |μ|^power for its eigenvalues μ. A bar has
-    the first colour if the number increases with the metric's length in that direction, otherwise the second.
+    A cross has two bars along the eigenvectors of the gradient, and the length of a bar is |μ|^power for the eigenvalue
+    μ. A bar has the first colour if the number grows with the metric's length along the bar, otherwise the second.
 
     Args:
         ax: the axes to draw on.
@@ -211,7 +211,7 @@ def degenerate_points(
         merge: the same as for `hks_jax.degenerate_points`, which computes the points.
         size: the radius of a mark, relative to the longer side of the grid.
         cmap: a diverging colour map; its middle belongs to index 0.
-        legend: whether to add a legend of the marks' indices and numbers.
+        legend: whether to add a legend with each index and the number of its points.
         **kwargs: arguments of `matplotlib.collections.PolyCollection`.
 
     Raises:

@@ -48,18 +48,18 @@ def scalar_image(
         cmap: the colour map, by default viridis or, with a centre, a diverging map with red above and blue below.
         vmin: the value of the first colour, by default from `quantiles`.
         vmax: the value of the last colour, by default from `quantiles`.
-        centre: the value of the middle colour unless vmin and vmax are given, such as 1 for 4πt·HKS, its value for a
-            flat metric. The colours reach equally far above and below it, but not below 0 if all values are ≥ 0. There
-            is no centre if all values are ≥ 0 and most are far above it.
+        centre: the value of the middle colour unless vmin and vmax are given, such as 1, the value of 4πt·HKS for a
+            flat metric. The colours reach equally far above and below the centre, but not below 0 if all values are
+            ≥ 0. The centre is ignored if all values are ≥ 0 and most values are far above the centre.
         quantiles: the quantiles of the values that get the first and the last colour, unless vmin and vmax are given.
-            The colour bar has arrows if values lie beyond.
+            The colour bar has arrows if other values lie beyond its ends.
         least_range: the least difference between the values of the first and the last colour, relative to the larger
             value. A larger range prevents colours from showing rounding or discretisation errors of a constant.
         colorbar: whether to add a colour bar.
         label: the colour bar's label.
         orientation: the orientation of the grid in space, which turns the image and adds space coordinates and letters.
         z: (*shape,) the distance of the values from a null value in standard deviations of noise
-            (`hks_jax.Uncertainty.z`). Values below `FADED` fade to grey, which they reach at 0.
+            (`hks_jax.Uncertainty.z`). Values fade to grey as |z| decreases from `FADED` to 0.
         **kwargs: arguments of `Axes.imshow`.
 
     Raises:

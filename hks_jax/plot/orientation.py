@@ -18,11 +18,11 @@ LETTERS = ("LR", "PA", "IS")
 
 
 class Orientation(NamedTuple):
-    """The directions of an array's axes in space, by which its image is turned.
+    """The directions of an array's axes in space, which determine how its image is turned.
 
-    The image does not depend on the storage order of the voxels. In the order left–right, back–front, foot–head its
-    horizontal axis precedes its vertical axis, and letters at its edges name the directions. The radiological view is
-    mirrored.
+    The image does not depend on the storage order of the voxels. The horizontal axis of the image precedes its vertical
+    axis in the order left–right, back–front, foot–head. Letters at the edges of the image name the directions. The
+    radiological view is mirrored.
 
     Attributes:
         axes: the array's axis for each axis of the image.
@@ -112,7 +112,7 @@ class Orientation(NamedTuple):
         return tuple(shape[a] - 1 - node[a] if turn else node[a] for a, turn in turned)
 
     def letter(self, ax: Axes, plane: tuple[int, int] = (0, 1)) -> None:
-        """Write letters at the edges of an image in a plane of two axes; mirror it if the view is radiological."""
+        """Write letters at the edges of an image that two axes span; mirror the image for the radiological view."""
         horizontal, vertical = (self.ends[a] for a in plane)
         left, right, bottom, top = *horizontal, *vertical
         if self.view == "radiological" and horizontal == LETTERS[0]:

@@ -39,7 +39,7 @@ def hks_panels(
         times: (n_times,).
         grid: the 2D grid of the values.
         titles: a title for each time, by default “t = …”.
-        unit: the unit of t, which follows its value.
+        unit: the unit of t, which titles show after the value of t.
         shared_range: whether all images use the colours of one range.
         limits: the values of the first and the last colour for each time.
         path: the file in which to save the figure, if given.

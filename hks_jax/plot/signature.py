@@ -26,7 +26,7 @@ METRICS = {"tensor": "D", "inverse": "D⁻¹", "adjugate": "|D|D⁻¹"}
 LEAST_RANGE = 0.01
 """The least range of the colours relative to the values, below which contrast is not enhanced."""
 RIM = 5
-"""The least distance from the boundary, in nodes, of values that set the colours, because the HKS is higher near it."""
+"""The distance from the boundary, in nodes, below which values do not set the colours; the HKS is higher there."""
 
 
 def signature_panels(
@@ -41,14 +41,14 @@ def signature_panels(
 
     The colours span the values away from the boundary, and a colour bar has arrows if other values lie beyond. With
     "flat" normalisation the colours diverge from 1, the value for a flat metric, unless most values are far above 1.
-    With error bars, deviations within the noise fade. Titles contain √(Dt), the distance of diffusion, if it is known.
+    With error bars, values that noise explains fade. Titles contain √(Dt), the distance of diffusion, if it is known.
 
     Args:
         result: the signature to draw.
         path: the file in which to save the figure, if given.
         title: the title, by default the normalisation and the metric.
         view: ``"neurological"`` (left is on the left) or ``"radiological"`` (left is on the right), for data in space.
-        through: the voxel through which slices run, or the nearest voxel in the domain; by default a central voxel.
+        through: the voxel through which slices run (or else the nearest in the domain); by default a central voxel.
 
     Raises:
         ValueError: if the result is on a mesh.

@@ -41,7 +41,7 @@ def surface(
 ) -> ScalarMappable:
     """Draw a surface, or the boundary of a solid, coloured by vertex values; return the mappable for a colour bar.
 
-    The axes are hidden. The colours of a solid depend only on its visible part.
+    The axes are hidden. The colours of a solid depend only on the values at its boundary.
 
     Args:
         ax: three-dimensional axes, from ``fig.add_subplot(projection="3d")``.

@@ -36,7 +36,7 @@ class DirectionField:
         grid = field.grid
         tensors = np.asarray(field.domain_tensors, dtype=np.float64)
         self.which = which
-        # (a, b) is λ₁ − λ₂ times (cos 2θ, sin 2θ) for the major angle θ. Division by the trace removes the unit.
+        # The components are the trace and, for the major direction's angle θ, (λ₁ − λ₂) cos 2θ and (λ₁ − λ₂) sin 2θ.
         difference = tensors[..., 0, 0] - tensors[..., 1, 1]
         components = np.stack([difference, 2 * tensors[..., 0, 1], np.trace(tensors, axis1=-2, axis2=-1)], -1)
         components[~grid.inside] = np.nan
@@ -99,7 +99,7 @@ def evenly_spaced_lines(
     *,
     separation: float,
 ) -> list[Float[np.ndarray, "m 2"]]:
-    """Return integral lines that fill the domain with a distance of about `separation`, in coordinates.
+    """Return integral lines that fill the domain at distances of about `separation`, in coordinate units.
 
     The method is due to Jobard and Lefer, “Creating evenly-spaced streamlines of arbitrary density” (1997). The next
     line starts as close as allowed to the existing lines. A line ends where it is closer than half the separation to
@@ -148,7 +148,7 @@ def _grow(forward: np.ndarray, backward: np.ndarray, others: cKDTree | None, gap
     """Cut a line where it is closer than `gap` to the others or to itself; join its ends if they meet."""
     if others is not None:
         forward, backward = (half[: _first(others.query(half)[0] < gap)] for half in (forward, backward))
-    # Points that are fewer steps apart may be close just because they are neighbours on the line.
+    # Points that are fewer than `lag` steps apart may be close only because they are neighbours on the line.
     lag = int(np.ceil(np.pi * gap / step)) + 1
     end = _first_return(forward, lag, gap)
     if end < len(forward):

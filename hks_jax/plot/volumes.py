@@ -60,8 +60,8 @@ def orthogonal_slices(
         axes: three axes, for the planes xy, xz and yz in this order.
         values: (*shape,), with NaN at nodes without a value.
         grid: the 3D grid of the values, whose spacing determines the aspect.
-        node: the indices (i, j, k) of the node. If it has no value, the nearest node with a value is used. By default
-            `middle_node` of the finite values.
+        node: the indices (i, j, k) of the node. If this node has no value, the nearest node with a value is used. The
+            default is `middle_node` of the nodes with a value.
         cross: whether thin lines show the positions of the other two slices.
         orientation: the orientation of the grid in space, which turns slices and adds coordinates and letters.
         z: (*shape,); values within the noise fade as in `scalar_image`.
@@ -123,7 +123,7 @@ def volume_panels(
         grid: the 3D grid of the values.
         node: the same as for `orthogonal_slices`.
         titles: a title for each time, by default “t = …”.
-        unit: the unit of t, which follows its value.
+        unit: the unit of t, which titles show after the value of t.
         length_unit: the unit of the coordinates.
         limits: the values of the first and the last colour for each time.
         path: the file in which to save the figure, if given.

@@ -91,7 +91,7 @@ class TensorNoise(eqx.Module):
 
     @classmethod
     def relative(cls, tensors: Any, level: float, grid: Grid | None = None, correlation: float = 0.0) -> "TensorNoise":
-        """Return noise with a given ratio of the standard deviation of Dᵢᵢ to the mean diffusivity tr D/d.
+        """Return noise with a given ratio of a diagonal component's standard deviation to the mean diffusivity.
 
         The noise is isotropic: the standard deviation of an off-diagonal component is smaller by the factor √2.
 
@@ -114,13 +114,13 @@ class TensorNoise(eqx.Module):
 
     @classmethod
     def from_scans(cls, first: Any, second: Any, grid: Grid) -> "TensorNoise":
-        """Estimate the noise of one scan from two scans of the same subject: half of their mean squared difference.
+        """Estimate the noise of one scan as half of the mean squared difference of two scans of the same subject.
 
         The function estimates one covariance, relative to the squared mean diffusivity, and one correlation length
         from all nodes inside the mask. A median gives the size of the covariance; the correlation of neighbours along
         the axes gives the length. The scans must be aligned, and their noise must be independent and have the same
-        covariance. The estimate of the noise includes the effect of motion between the scans.
-        The mean of both scans has half this covariance.
+        covariance. The estimate includes the effect of motion between the scans. The mean of both scans has half of
+        the estimated covariance.
 
         Args:
             first: (*shape, d, d), the tensors of the first scan.
@@ -140,7 +140,7 @@ class TensorNoise(eqx.Module):
         relative = np.einsum("na,nb->ab", parts[inside], parts[inside]) / (2 * inside.sum())
         if not np.trace(relative) > 0:
             raise ValueError("first, second: got equal tensors; expected different noise. Pass a second scan")
-        # The median of q is scaled to the median of χ², because a few nodes, as in fluid, have much more noise.
+        # The median of q is scaled to the median of χ², because a few nodes, such as nodes in fluid, are much noisier.
         q = np.einsum("na,ab,nb->n", parts[inside], np.linalg.pinv(2 * relative), parts[inside])
         relative *= np.median(q) / (2 * scipy.special.gammaincinv(len(relative) / 2, 0.5))
         # Smoothed white noise has the correlation exp(−h²/4w²) at the distance h.

@@ -40,7 +40,7 @@ _LOUD = 3.0
 
 
 class _Moments(eqx.Module):
-    """Over balanced samples, the sum of squared linear parts, and the mean and squared deviations of even parts."""
+    """The sum of squared linear parts of balanced samples, and the mean and squared deviations of their even parts."""
 
     n: Array
     odd: Any
@@ -59,10 +59,10 @@ class _Moments(eqx.Module):
 
 
 # Let η₁, η₂, η₃ be independent noise with the covariance Σ. The four sums δ = (±η₁ ± η₂ ± η₃)/√3 are the corners of a
-# tetrahedron; each δ has the covariance Σ. Let y be the four maps at D + sδ. The δ add up to zero, so the mean of y
-# minus the value is of second order, and its expectation is s² times the bias. Up to second order, we have
-# y₁ + y₂ − y₃ − y₄ = 4sJη₁/√3; similar formulas give Jη₂ and Jη₃. So four maps give three samples, whereas two
-# antithetic pairs give two. A quadratic form of one δ has the second-order variance; the mean of four has a third.
+# tetrahedron; each δ has the covariance Σ. Let y be the four maps of D + sδ, where D are the measured tensors and s is
+# `_SCALE`. The δ add up to zero, so the mean of y minus the map of D is of second order, with the expectation s² times
+# the bias. Up to second order, y₁ + y₂ − y₃ − y₄ = 4sJη₁/√3 with the Jacobian J; similar formulas give Jη₂ and Jη₃. So
+# four maps give three samples. A quadratic form of δ, averaged over the four δ, has a third of its variance for one δ.
 @jax.jit
 def _parts(maps: list[Any], value: Any) -> tuple[Any, Any]:
     """Return the samples Jη (3, …) of the noise of the value, and the even part, whose expectation is the bias."""
@@ -100,21 +100,21 @@ def uncertainty(
         bars = hj.uncertainty(signature, D, hj.TensorNoise.relative(D, 0.1))
         bars.deviation, bars.bias, bars.interval(0.95), bars.z(1.0), bars.summary()
 
-    Four samples δ of the noise with sum zero are drawn at a time, and maps of D + δ/2 are computed. The differences of
-    the maps give three samples of the error of the value, and the mean of the maps gives the bias. The noise is halved,
-    because the measured tensors already contain noise. The relative error of a deviation is 29 % with 8 draws, and 8 %
-    with 100 draws.
+    Four samples δ of the noise, which add up to zero, are drawn at a time, and the maps of D + δ/2 are computed. The
+    differences of these maps give three samples of the error of the value, and their mean gives the bias. The noise is
+    halved, because the measured tensors D already contain noise. The relative error of a deviation is 29 % with 8
+    draws, and 8 % with 100 draws.
 
     Args:
         function: maps tensors (*shape, d, d) to an array, or to a pytree of arrays. JAX must be able to trace the
             function, unless `compiled` is false. Times and energies should be fixed, and not depend on the eigenpairs.
         tensors: (*shape, d, d), the measured tensors at nodes or cells; positive definite at nodes with noise.
         noise: the noise of the tensors (see `TensorNoise`).
-        method: ``"resample"`` computes maps of noisy tensors. ``"exact"`` computes the variance gᵀΣg of each number of
-            the result by one reverse-mode product. ``"linear"`` computes `draws` products with one linearisation. Both
-            ``"exact"`` and ``"linear"`` also compute eight maps, for the bias and the second-order variance. ``"auto"``
-            chooses ``"exact"`` if the result has at most `draws` numbers, or else ``"resample"``, because a product
-            with the Jacobian of a signature takes as long as one or two signatures.
+        method: ``"resample"`` computes maps of noisy tensors. ``"exact"`` computes the first-order variance of each
+            number of the result by one reverse-mode product. ``"linear"`` multiplies `draws` samples of the noise by
+            the Jacobian. Both of these methods also compute eight maps for the bias and the second-order variance.
+            ``"auto"`` chooses ``"exact"`` if the result has at most `draws` numbers, or else ``"resample"``, because a
+            product with the Jacobian of a signature takes as long as one or two signatures.
         draws: the number of noisy maps (products for ``"linear"``), at least 8; rounded up to a multiple of four.
         smoothing: the standard deviation, in coordinate units, of a Gaussian that smooths the tensors before the
             function is evaluated (see `smooth_tensors`); the noise must have a grid. 0 for no smoothing.
@@ -244,7 +244,7 @@ def _positive(measured: Array, noisy: Array) -> tuple[Array, Array]:
 
 
 def _white(noise: TensorNoise, seed: Any, index: Any, dtype: Any) -> Array:
-    """Return the standard normal numbers of one draw, the argument of `TensorNoise.tensors`."""
+    """Return the standard normal numbers of one draw, which are the argument of `TensorNoise.tensors`."""
     key = jax.random.fold_in(jax.random.key(seed), index)
     return jax.random.normal(key, noise.white_shape, dtype)
 
@@ -253,7 +253,7 @@ def _white(noise: TensorNoise, seed: Any, index: Any, dtype: Any) -> Array:
 def _four(measured: Array, noise: TensorNoise, seed: Any, index: Any) -> tuple[list[Array], Array]:
     """Return four noisy fields, and the sum of their shares of tensors that the full noise would make indefinite.
 
-    Each field contains half of its noise, and the four noises have the sum zero.
+    The four samples of the noise add up to zero, and each field contains half of one sample.
     """
     each = jnp.stack([noise.tensors(_white(noise, seed, 3 * index + i, measured.dtype)) for i in range(3)])
     changes = jnp.tensordot(
@@ -313,7 +313,7 @@ def _sampled(
 
 
 def _exact(function: Callable[[Array], Any], D: Array, noise: TensorNoise) -> Any:
-    """Return the variance gᵀΣg of every number of the result by a reverse-mode product for each."""
+    """Return the variance gᵀΣg of each number of the result, by one reverse-mode product for its gradient g."""
 
     @jax.jit
     def squares(D: Array, noise: TensorNoise) -> Any:
@@ -327,7 +327,7 @@ def _exact(function: Callable[[Array], Any], D: Array, noise: TensorNoise) -> An
 
 
 def _linear(function: Callable[[Array], Any], D: Array, noise: TensorNoise, seed: int, draws: int) -> Any:
-    """Return the mean of (Jδ)² over draws of the noise δ, where J is the Jacobian."""
+    """Return the mean of (Jδ)² over draws δ of the noise, where J is the Jacobian of the function."""
     value, push = jax.linearize(jax.jit(function), D)
 
     @jax.jit

@@ -64,8 +64,8 @@ class Uncertainty(eqx.Module):
     def interval(self, level: float = 0.95) -> tuple[Any, Any]:
         """Return the lower and the upper ends of intervals that contain the true value with probability `level`.
 
-        The centre of an interval is the corrected value. The width of an interval follows Student's distribution, which
-        takes account of the number of draws. The errors must be normally distributed (see `trusted`).
+        The centre of an interval is the corrected value. The width of an interval follows from Student's distribution
+        with `freedom` degrees of freedom. The errors must be normally distributed (see `trusted`).
         """
         require_number("level", level, 1)
         quantile = float(scipy.special.stdtrit(min(self.freedom, 1e6), 0.5 + level / 2))
@@ -73,7 +73,7 @@ class Uncertainty(eqx.Module):
         return jax.tree.map(jnp.subtract, self.corrected, half), jax.tree.map(jnp.add, self.corrected, half)
 
     def z(self, reference: Any = 0.0) -> Any:
-        """Return (value − reference)/deviation. For 4πt·HKS, the reference 1 is the value of flat space."""
+        """Return (value − reference)/deviation. For 4πt·HKS, the reference 1 compares the value with flat space."""
         return jax.tree.map(lambda v, s: (v - reference) / s, self.value, self.deviation)
 
     @property
@@ -88,7 +88,7 @@ class Uncertainty(eqx.Module):
             maps = (len(deviation) if deviation.ndim > 1 else deviation.size, -1)
             share = jnp.abs(bias / jnp.where(deviation > 0, deviation, jnp.nan)).reshape(maps)
             second = jnp.where(deviation > 0, beyond, jnp.nan).reshape(maps)
-            # The median of an estimate from few draws is below its mean. The ratio of median and mean scales the limit.
+            # The median of an estimate from few draws is below its mean, so the limit is multiplied by their ratio.
             limit = BEYOND * float(scipy.special.fdtri(self.samples, min(self.freedom, 1e6), 0.5))
             small = (jnp.nanmedian(second, axis=1) <= limit) & (jnp.nanmedian(share, axis=1) <= 1)
             return (small & (self.indefinite <= INDEFINITE)).reshape(deviation.shape[:1])

@@ -173,7 +173,7 @@ def _spelled(name: str, value: Any) -> str:
 
 
 def _open(args: argparse.Namespace, subjects: list[Subject], progress: StudyProgress) -> Study:
-    """Return the study with explicit times and write its description; raise ValueError if the folder has another."""
+    """Return the study with explicit times and write its description; raise ValueError if there is another study."""
     study = Study(args.output, Settings.of(args), args.time_unit, reading_options(args), args.save_pairs)
     times = study.settings.times
     before, chosen = read_json(args.output / "study.json"), "explicit" if times.explicit else f"auto:{times.automatic}"
@@ -217,7 +217,7 @@ def _suitable(
 
 
 Range = tuple[float, float]
-"""The least time that suits a subject, which voxels and eigenpairs limit, and the largest, which the size limits."""
+"""The least and the largest time that suit a subject. Voxels and eigenpairs limit the least, the size the largest."""
 
 
 def suitable_range(volume: TensorVolume, args: argparse.Namespace) -> Range:

@@ -151,7 +151,7 @@ class Study:
             )
 
     def write_description(self, subjects: list[Subject], chosen: str) -> None:
-        """Write the files that describe the study: those of a BIDS derivative, and study.json with the times."""
+        """Write the files that describe the study: the description of a BIDS derivative, and study.json with times."""
         description = {
             "Name": "Heat kernel signatures of diffusion tensor fields",
             "BIDSVersion": "1.10.0",

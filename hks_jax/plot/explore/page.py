@@ -29,7 +29,7 @@ SCRIPTS = ("data", "colours", "image", "mesh", "curves", "regions", "controls", 
 """The page's scripts in the order of their dependencies."""
 COLOURS = {"sequential": "viridis", "diverging": "RdBu_r", "distance": "inferno_r", "grey": "gray"}
 LIMIT = 256 * 1024**2
-"""The maximum bytes of numbers in a page. Their text is a third longer, and browsers limit a text to 512 MiB."""
+"""The maximum bytes of numbers in a page. Numbers as text are a third longer, and browsers limit a text to 512 MiB."""
 
 
 def explore(
@@ -57,8 +57,8 @@ def explore(
         result: the signature at increasing times. Nodes without finite values at all times are omitted; on a surface,
             all values must be finite. The normalisations ``"raw"`` and ``"flat"`` are shown as (4πt)^(d/2)·HKS, which
             is 1 for flat space without boundary, with colours that diverge from 1. With the standard deviations
-            ``arrays["deviation"]``, curves of points have a band, and values within the noise of flat space or of the
-            mean fade. Tensors, if they are known, are shown as mean eigenvalue, anisotropy and principal direction
+            ``arrays["deviation"]``, curves of points have a band, and values fade if noise explains their difference
+            from flat space or from the mean. Tensors, if known, give the mean eigenvalue, anisotropy and direction
             (red, green and blue for x, y and z). With an affine, positions are shown in space, and the sides of images
             have the letters L and R, P and A, I and S. For the metric D⁻¹, the distance √(Dt) is shown beside t.
         path: the file of the page; its folder is created.
@@ -66,7 +66,7 @@ def explore(
         labels: (*shape) integers that define regions, 0 for none.
         label_names: the names of the labels.
         title: the page's title.
-        unit: the unit of t, by default the result's.
+        unit: the unit of t, by default the unit of the result.
 
     Returns:
         The path.
@@ -202,7 +202,7 @@ def _regions(
 
 
 def _in_space(result: Result) -> dict[str, Any]:
-    """Return the positions of the nodes in space, and the names of the grid's sides by the nearest axes of space."""
+    """Return the matrix from indices to positions in space, and the letters of the grid's sides, if they are known."""
     volume = result.place
     if not isinstance(volume, TensorVolume) or volume.affine is None:
         return {"world": None, "ends": None}
