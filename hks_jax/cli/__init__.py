@@ -61,7 +61,7 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code: 0 success, 1 failed computation, 2 bad input, 130 interrupt.
 
-    Output files are written atomically and together at the end, so a failed command writes no file. Exceptions are the
+    Output files are written atomically and together at the end, so a failed command writes no file, except for the
     files of `paper` and `batch`, the checkpoint of `fit` and the eigenpairs of `hks`.
     """
     argv, parser = sys.argv[1:] if argv is None else argv, build_parser()

@@ -77,7 +77,7 @@ class Progress:
         """Show the progress of the current stage, in place on a terminal or otherwise every few seconds.
 
         If the text has an estimate of the remaining time (`hks_jax.eigen.solver.Status`), the estimate and a bar of the
-        elapsed fraction are shown with it.
+        elapsed fraction are also shown.
         """
         now, left = time.perf_counter(), getattr(text, "seconds_left", None)
         with self._lock:

@@ -70,22 +70,22 @@ def smoothing(grid: Grid, length: float, dtype: np.dtype) -> Smoothing:
 _TOP = 0.03
 """The size of the largest eigenvalues of JᵀJ, where J is the Jacobian of the data, for weights that add up to one."""
 _POWER, _REACH = 3, 9.0
-"""Of all preconditioners (1 + λt/a)ⁿ, this power n and this a took nearly the fewest steps on 32² and 64² nodes."""
+"""Of all preconditioners (1 + λt/a)ⁿ, n = 3 and a = 9 needed nearly the fewest steps on 32² and 64² nodes."""
 
 
 # In the plane the metric (1 + εu) I has the Laplacian (1 − εu) Δ and the area element (1 + εu) dx. By Duhamel's formula
-# its signature is h₀ (1 + εv) with h₀ = 1/(4πt). For u(z) = exp(iξ·z) and x = t|ξ|²,
+# this metric has the signature h₀ (1 + εv) with h₀ = 1/(4πt). For u(z) = exp(iξ·z) and x = t|ξ|²,
 #
 #     v = a(x) u,    a(x) = ∫₀¹ (1 + x (1 − s)²) exp(−x s (1 − s)) ds − 1.
 #
 # For small x, a(x) is x/6, which is the contribution tK/3 of the curvature K; for large x, a(x) is of order 1/x. So JᵀJ
 # is about Σₜ wₜ a(tL)², where wₜ are the weights of the times and L is the Laplacian. Except for the first few, the
-# eigenvalues of JᵀJ decrease with frequency. On a grid they decrease faster, because interpolation damps oscillations.
+# eigenvalues of JᵀJ decrease with frequency, on grids even faster, because interpolation damps oscillations.
 class ConformalInformation(eqx.Module):
     """The preconditioner B½ (1 + L/λ₁)⁻³ B½, where B is the lumped mass and L is a Laplacian of the initial metric.
 
-    Applying its inverse takes three products with L. The matrix of the fit is JᵀJ + μB with the damping μ, so its
-    eigenvalues are at least about μ. The parameter λ₁ is so large that the preconditioner has the same bound.
+    Applying the inverse takes three products with L. With the damping μ, the matrix JᵀJ + μB has eigenvalues of at
+    least about μ, and λ₁ is chosen so large that the preconditioner has the same lower bound.
     """
 
     unknowns: Nodal  # the conformal factors at the nodes

@@ -58,7 +58,7 @@ def fit_metric(
         data: the kind of signature, the measure of differences, and the weights and noise of entries.
         regularisers: penalties from `hks_jax.inverse`: `H1`, `TotalVariation`, `LogDeterminant`, `Prior`.
         k: the number of eigenpairs. By default, the pairs beyond k contribute a share of 1e-6 to the heat trace at the
-            smallest time, by Weyl's law, or k is maximal. The default k grows if the fit reaches a field of more
+            smallest time, by Weyl's law, or k is maximal. The default k increases if the fit reaches a field of more
             volume. For a wave kernel signature of width σ, energies up to 2σ above the largest energy are included.
         boundary: the same as for `eigenpairs`.
         solver: the eigensolver; ``"auto"`` chooses a solver that suits many products with the same Jacobian.
@@ -68,7 +68,7 @@ def fit_metric(
 
     Warns:
         AccuracyWarning: if the misfit is close to the truncation error of k pairs, so that the fitted metric may
-            compensate for the truncation, or if the misfit stays above the noise, so that it does not explain the data.
+            compensate for truncation, or if the misfit stays above the noise, so that the metric misses the target.
 
     Raises:
         TypeError: if `init` is neither a grid nor a field.

@@ -20,7 +20,7 @@ _Options = dict[str, Any]
 _Tags = frozenset[object]
 
 _TIGHTER, _LONGER = 30, 3
-"""For a step that may be the last, the factors of the linear system's accuracy and of its maximum of products."""
+"""The factors of the accuracy and of the maximum number of products in the linear system of a step that may be last."""
 _ACCEPTED, _GOOD, _SHRINKING = 0.01, 0.5, 0.25
 """The shares of the predicted reduction to accept a step and to reduce damping; the step size's factor on rejection."""
 _FREE = 0.01
@@ -69,7 +69,7 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _State]):
         damping: the damping μ of the first step, relative to the scale of the data.
         growth: the divisor of μ after a step that reduces the misfit as much as its linearisation predicts.
         inner_product: the inner product B, in whose norm steps are damped.
-        inner_tolerance: the relative residual of the linear system; 30 times smaller if the step may be the last.
+        inner_tolerance: the relative residual at which a linear solve ends; 30 times smaller if a step may be the last.
         inner_steps: the maximum number of products with JᵀJ in a step; three times larger if the step may be the last.
         preconditioner: the preconditioner of the conjugate gradients; B by default.
 

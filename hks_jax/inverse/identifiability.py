@@ -17,7 +17,7 @@ from hks_jax.linear import lapack
 from hks_jax.linear.chebyshev import chebyshev_recurrence
 
 _ROUNDS = 4
-"""The number of rounds of Chebyshev filtering for the weakest directions. Each starts from the previous result."""
+"""The number of rounds of Chebyshev filtering for the weakest directions. Each round continues the previous one."""
 
 
 class Identifiability(eqx.Module):
@@ -29,12 +29,12 @@ class Identifiability(eqx.Module):
 
     Attributes:
         strengths: (n,) the largest eigenvalues s² of JᵀJ in descending order, for unit residual variance.
-        directions: (n, *values) their eigenvectors, normalised.
+        directions: (n, *values) the normalised eigenvectors of JᵀJ for these eigenvalues.
         weak_strengths: (n_weak,) upper estimates of the smallest eigenvalues in ascending order.
         weak_directions: (n_weak, *values) the directions that the data determine least.
         resolution: (nodes,) a lower bound, from n directions, on the share of each node's unknowns that data determine.
         deviation: (nodes,) the posterior standard deviation of each node's unknowns (root mean square) from the n
-            directions. To first order it is an upper bound on the exact deviation under a white prior, that is, for
+            directions. To first order, it is at least the exact deviation under a white prior, that is, for
             independent unknowns with standard deviation τ. A prior that couples neighbours reduces the deviation.
         effective: the number of unknowns that the data determine, Σ s²/(s² + σ²/τ²) over the n directions.
         noise: the standard deviation σ of the residuals.
@@ -124,7 +124,7 @@ def identifiability(
 
 
 def _information(problem: Problem, values: Values) -> Any:
-    """Return a function that multiplies each flat direction of a batch by JᵀJ, where J belongs to the data."""
+    """Return a function that multiplies each flat direction of a batch by JᵀJ, where J is the data's Jacobian."""
 
     def data(flat: Array) -> Array:
         return problem.observation.residuals(problem.pairs(flat.reshape(values.shape)))

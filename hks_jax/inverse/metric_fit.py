@@ -119,7 +119,7 @@ class MetricFit:
 
     @property
     def hks(self) -> Array:
-        """The signature of the fitted metric, of the kind and shape of the target. Each access computes it again."""
+        """The signature of the fitted metric, of the kind and shape of the target; each access computes it again."""
         return self.problem.observation.predict(self.problem.pairs(self.values))
 
     def uncertainty(self, prior: float = 1.0, noise: float | None = None, draws: int = 32, seed: int = 0) -> Posterior:

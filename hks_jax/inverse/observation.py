@@ -80,7 +80,7 @@ class Observation(eqx.Module):
     """The observed entries of a target."""
 
     target: Float[Array, " m"]  # the observed values
-    root_weights: Float[Array, " m"]  # the square roots of their weights; the weights add up to one
+    root_weights: Float[Array, " m"]  # the square roots of weights that add up to one
     times: Float[Array, " n_times"] | None  # the times, energies, or None
     signature: Signature  # the kind of signature
     shape: tuple[int, ...] = eqx.field(static=True)  # the shape of the whole target

@@ -22,7 +22,7 @@ from hks_jax.inverse.unknowns import Unknowns, Values
 from hks_jax.signatures.truncation import resolving
 
 _NEAR = 0.1
-"""The share of the misfit due to truncation above which a warning is issued; its root is about a third."""
+"""A warning is issued if truncation causes more than this share of the misfit (about a third of the residuals)."""
 _ENOUGH = 1e-5
 """The least tolerance of the solver's derivative for which single precision suffices. For the Jacobian J on 64² nodes,
 single precision causes errors of 1e-6 in J and up to 3e-5 in Jᵀ; this tolerance causes errors of 5e-6 and 5e-5."""

@@ -90,7 +90,7 @@ class TotalVariation(Regulariser):
 
 
 class LogDeterminant(Regulariser):
-    """The penalty ½ weight · mean (log |T| − log |T₀|)², which keeps the volume element of T near that of T₀.
+    """The penalty ½ weight · mean (log |T| − log |T₀|)², where T₀ is `prior`; it preserves the volume element.
 
     Examples:
         >>> scaled = hj.inverse.Free(lambda s: s * field.tensors, jnp.ones(1), field)
@@ -109,7 +109,7 @@ class LogDeterminant(Regulariser):
 
 
 class Prior(Regulariser):
-    """The penalty ½ weight · mean ‖log T − log T₀‖² on the log-Euclidean distance of the tensors T to a field T₀.
+    """The penalty ½ weight · mean ‖log T − log T₀‖² on the log-Euclidean distance to the tensors T₀ of `prior`.
 
     Examples:
         >>> scaled = hj.inverse.Free(lambda s: s * field.tensors, jnp.ones(1), field)

@@ -32,14 +32,14 @@ class Search:
         optimiser: ``"gauss-newton"`` (damped, matrix-free), ``"lbfgs"``, ``"bfgs"``, or a solver of optimistix.
         smoothness: the length, in coordinate units, below which Gauss–Newton steps are smooth, or 0 for steps without
             smoothing. The default is a tenth of the domain, and 0 for ``"conformal"`` without noise.
-        tolerance: a fit has converged when the unknowns u change by less than this, relative to 1 + |u| (root mean
-            square). Both the last step and the sum of future steps must satisfy this criterion; a geometric series
+        tolerance: a fit has converged when the unknowns u change by less than the tolerance, relative to 1 + |u| (root
+            mean square). Both the last step and the sum of future steps must satisfy this criterion; a geometric series
             predicts future steps. Linear systems of steps that may be the last are solved 30 times more exactly with
             three times as many products. Directions that these products do not reach are ignored; `identifiability`
             finds them. Solvers of optimistix test only the last step.
         max_steps: the maximum number of steps in each stage.
         continuation: the number of stages. The first stage fits only the largest times, the last stage fits all times.
-        starts: the number of starts, from the initial field and from random smooth changes of it; the best is kept.
+        starts: the number of starts: the initial field and random smooth changes of this field. The best fit is kept.
         spread: the root mean square of the random changes, in the parameters' units.
         seed: the seed of the random changes.
 

@@ -50,7 +50,7 @@ class Parametrisation(eqx.Module):
 
 
 def _logarithm(base: Tensors) -> Parameters:
-    """Return the diagonal of log T and √2 times the entries below it; their Euclidean norm is the Frobenius norm."""
+    """Return the diagonal of log T and √2 times the entries below, whose norm is the Frobenius norm of log T."""
     logarithm = spd.log(base)
     rows, columns = np.tril_indices(base.shape[-1], -1)
     diagonal = jnp.diagonal(logarithm, axis1=1, axis2=2)

@@ -204,7 +204,7 @@ def _covariance(
     covariance[inside] = turned @ (variance[:, None, None] * inverse[:, :6, :6]) @ turned.T
     if noise != "residuals":
         return covariance, None
-    # The fit reproduces some images exactly, such as a single unweighted image. There, a random ±σ replaces residual 0.
+    # The fit reproduces some images exactly, such as a single unweighted image. A random ±σ replaces their residuals.
     unseen = np.random.default_rng(0).choice([-1.0, 1.0], data.shape) * np.sqrt(variance)[:, None]
     modes = np.zeros((*inside.shape, len(design), 6), np.float32)
     for i, x in enumerate(design):  # a loop saves memory

@@ -59,7 +59,7 @@ def read_tensors(
     Args:
         path: the file, or six files.
         order: ``"nifti"`` (xx xy yy xz yz zz), ``"fsl"`` (xx xy xz yy yz zz), ``"mrtrix"`` (xx yy zz xy xz yz) or
-            ``"vtk"`` (xx yy zz xy yz xz). None uses the declared order. Omit it for whole matrices.
+            ``"vtk"`` (xx yy zz xy yz xz). None uses the declared order. Omit `order` for whole matrices.
         mask: a file (see `read_mask`) or a bool array of the volume's shape. None uses the file's mask, if any.
         frame: the axes of the file's components: ``"voxel"``; ``"fsl"`` (voxel axes, where the first is reversed if the
             affine's determinant is positive); ``"world"`` (the axes of the file's space); ``"measurement"`` (NRRD's

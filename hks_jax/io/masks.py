@@ -81,7 +81,7 @@ def erode(mask: Bool[np.ndarray, "*shape"], iterations: int = 1) -> Bool[np.ndar
 
 
 def read_labels(path: str | os.PathLike[str], on: TensorVolume | SimplicialMesh) -> Integer[np.ndarray, "*shape"]:
-    """Read integer labels at the voxels of an image or the vertices of a mesh from NIfTI or ``.npy``; 0: unlabelled.
+    """Read integer labels at the voxels of an image or the vertices of a mesh from NIfTI or ``.npy`` (0: unlabelled).
 
     If the labels and the image have affines, their voxels must coincide. For a slice, the file may have the labels of
     the whole volume, or of the slice in two dimensions. Otherwise, the labels must have the shape of the image.

@@ -172,7 +172,7 @@ def _same_places(vertices: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, " V"]:
 
 
 def _require_joined(loaded: Loaded) -> str:
-    """Return a warning if vertices coincide, or else the empty text; raise ValueError if pieces of the mesh touch."""
+    """Return a warning if vertices coincide, otherwise the empty text; raise ValueError if pieces touch there."""
     first = _same_places(loaded.vertices)
     doubled = int((first != np.arange(len(first))).sum())
     if not doubled:

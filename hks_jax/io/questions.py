@@ -19,7 +19,7 @@ _BLOCK, _BLOCKS = 8, 8
 """The size of blocks, in voxels per axis, and their least number. The standard error of a mean comes from the scatter
 between blocks, because neighbouring voxels are correlated."""
 CLEAR = 3.5
-"""The difference between two mean angles, in standard errors, above which it is significant."""
+"""The number of standard errors above which the difference between two mean angles is significant."""
 _SMOOTH = 3.0
 """The mean angle, in degrees, below which differences between frames come from the discrete steps between voxels."""
 
@@ -85,7 +85,7 @@ def coherence(volume: TensorVolume) -> Coherence | None:
 
     The principal direction v at an anisotropic voxel is compared with the mean direction at its two neighbours along
     ±v, if both are anisotropic. The angle between v and this mean is least in the correct frame. Alternative axes are
-    the frames of `read_tensors` and reversals. The result is None for a slice, or for fewer than 1000 such angles.
+    the frames of `read_tensors` and reversed axes. The result is None for a slice, or for fewer than 1000 such angles.
     """
     if volume.dimension != 3:
         return None

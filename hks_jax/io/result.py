@@ -179,7 +179,7 @@ class Result:
 
     @property
     def z(self) -> Float[np.ndarray, "n_times *shape"] | None:
-        """The values minus the value of flat space (raw, flat) or their median, divided by the standard deviation."""
+        """The values minus the value of flat space (raw, flat) or their median (otherwise), in standard deviations."""
         if "deviation" not in self.arrays:
             return None
         flat = {"raw": 1 / self.flat_scale, "flat": 1.0}

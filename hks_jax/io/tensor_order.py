@@ -116,8 +116,8 @@ class InvalidByOrder(NamedTuple):
 def invalid_by_order(components: Float[np.ndarray, "*shape n"], order: str) -> InvalidByOrder | None:
     """Count the tensors that are not positive definite in each order; return None if few are invalid in `order`.
 
-    The counts do not depend on the axes of the components. They hardly distinguish ``"mrtrix"`` from ``"vtk"``, which
-    differ by an exchange of two off-diagonal components.
+    The counts do not depend on the axes of the components, and hardly distinguish ``"mrtrix"`` from ``"vtk"``, two
+    orders that differ by an exchange of two off-diagonal components.
     """
     rows = components.reshape(-1, components.shape[-1])
     rows = rows[np.any(rows != 0, axis=-1)]

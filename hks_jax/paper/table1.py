@@ -16,7 +16,7 @@ from hks_jax.paper.signature import signature
 TIME = 1.0
 REFERENCE_SIZE = 400
 REFERENCE_PAIRS = 300
-# At t = 1 the pairs after 200 have factors exp(−λt) < 1e-5; the smallest difference in the quick table is 5e-3.
+# At t = 1 the pairs beyond k = 200 have factors exp(−λt) < 1e-5; the smallest difference in the quick table is 5e-3.
 QUICK_PAIRS = 200
 STORED = "bumpy_torus_p1_400x400_k300_t1.npy"
 SYMMETRY = 10  # cos 10u has ten periods around the torus

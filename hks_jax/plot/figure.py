@@ -83,7 +83,7 @@ def cell_extent(grid: Grid) -> tuple[float, float, float, float]:
 
 
 def panel_size(grid: Grid, side: float, steepest: float = 4.0) -> tuple[float, float]:
-    """Return an image's width, which is at most `side`, and its height. Their ratio is at most `steepest`."""
+    """Return an image's width, at most `side`, and height; the larger is at most `steepest` times the smaller."""
     x0, x1, y0, y1 = cell_extent(grid)
     aspect = min(max((y1 - y0) / (x1 - x0), 1 / steepest), steepest)
     width = side / max(1.0, aspect**0.5)
@@ -114,7 +114,7 @@ def inches(ax: Axes) -> Float[np.ndarray, "2"]:
 
 
 def side_in_inches(ax: Axes, extent: Sequence[float]) -> float:
-    """Return the length in inches of an extent's longer side, for equal aspect on the axes before layout."""
+    """Return the length in inches of the longer side of an extent that is drawn on the axes with equal aspect."""
     return float(np.min(inches(ax) / extent) * np.max(extent))
 
 

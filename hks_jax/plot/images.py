@@ -188,8 +188,8 @@ def panel_colours(
 ) -> list[dict[str, Any]]:
     """Return the arguments of `scalar_image` for each image, given the arguments for all images.
 
-    The values of the first and the last colour of each image are its `limits`. Without limits they follow from the
-    values of the image, or of all images together if `shared` is set.
+    The values of the first and the last colour of each image are its `limits`. Without limits, they follow from the
+    values of the image or, if `shared` is set, from the values of all images.
     """
     rules = {name: kwargs.pop(name) for name in RULES if name in kwargs}
     if limits is not None:

@@ -137,7 +137,7 @@ def bounding_box(inside: Bool[np.ndarray, "*shape"], margin: int = 2) -> tuple[s
 
 
 def away_from_rim(inside: Bool[np.ndarray, "*shape"]) -> Bool[np.ndarray, "*shape"]:
-    """Mark the nodes at least `RIM` nodes from the boundary, or closer if less than a third would remain."""
+    """Mark nodes at least `RIM` nodes from the boundary, or closer nodes too if less than a third would remain."""
     deep = inside
     for _ in range(RIM):
         smaller = ndimage.binary_erosion(deep)

@@ -117,7 +117,7 @@ def isosurfaces(
 
     Args:
         ax: two-dimensional axes, whose frame and ticks are removed.
-        values: (*shape,), with NaN at nodes without a value. Surfaces end at elements with such a node.
+        values: (*shape,), with NaN at nodes without a value. Surfaces end at elements with a NaN.
         grid: the 3D grid of the values.
         levels: the values of the surfaces, or the number of evenly spaced values between the first and the last colour.
         cmap: colour map.

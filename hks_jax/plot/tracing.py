@@ -36,7 +36,7 @@ class DirectionField:
         grid = field.grid
         tensors = np.asarray(field.domain_tensors, dtype=np.float64)
         self.which = which
-        # The components are the trace and, for the major direction's angle θ, (λ₁ − λ₂) cos 2θ and (λ₁ − λ₂) sin 2θ.
+        # The components are (λ₁ − λ₂) cos 2θ, (λ₁ − λ₂) sin 2θ and λ₁ + λ₂, where θ is the major direction's angle.
         difference = tensors[..., 0, 0] - tensors[..., 1, 1]
         components = np.stack([difference, 2 * tensors[..., 0, 1], np.trace(tensors, axis1=-2, axis2=-1)], -1)
         components[~grid.inside] = np.nan
@@ -238,8 +238,8 @@ def integral_lines(
         field: a 2D field.
         which: ``"major"``, the eigenvector of the larger eigenvalue of T, or ``"minor"``.
         seeds: (n, 2) points on the lines, by default the seeds of evenly spaced lines.
-        density: the density of evenly spaced lines. At 1 their distance is 1/25 of the longer side or, on small axes,
-            more.
+        density: the density of evenly spaced lines. At a density of 1, the distance between lines is 1/25 of the longer
+            side or, on small axes, more.
         **kwargs: arguments of `matplotlib.collections.LineCollection` (``colors``, ``linewidths``, ``alpha``).
 
     Raises:

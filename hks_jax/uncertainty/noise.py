@@ -74,7 +74,7 @@ class TensorNoise(eqx.Module):
         """Return noise Σᵢ zᵢ mᵢ, where mᵢ are n given fields and zᵢ are independent standard normal numbers.
 
         For a scan, the field mᵢ is the change of the tensors that the residuals of image i cause
-        (`hks_jax.io.TensorVolume.modes`). Random factors for whole images are a wild bootstrap. The noise is then
+        (`hks_jax.io.TensorVolume.modes`). One random factor per image makes a wild bootstrap. The noise is then
         correlated between voxels as the residuals are. Such correlations are caused by the image reconstruction, by
         drift of the scanner, by motion between images, and by diffusion that no tensor describes.
 
@@ -143,7 +143,7 @@ class TensorNoise(eqx.Module):
         # The median of q is scaled to the median of χ², because a few nodes, such as nodes in fluid, are much noisier.
         q = np.einsum("na,ab,nb->n", parts[inside], np.linalg.pinv(2 * relative), parts[inside])
         relative *= np.median(q) / (2 * scipy.special.gammaincinv(len(relative) / 2, 0.5))
-        # Smoothed white noise has the correlation exp(−h²/4w²) at the distance h.
+        # White noise, smoothed with the width w, has the correlation exp(−h²/4w²) at the distance h.
         widths = []
         for axis, h in enumerate(grid.spacing):
             x, y = (np.moveaxis(inside, axis, 0)[part] for part in (slice(1, None), slice(None, -1)))

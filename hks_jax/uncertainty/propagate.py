@@ -32,7 +32,7 @@ _BALANCED = len(_SIGNS)
 _LEAST = 8
 """The least number of noisy maps for an estimate of the bias and of the second-order variance."""
 _SCALE = 0.5
-"""The factor s of the added noise. It is less than 1, because the measured tensors already contain noise."""
+"""The factor s of the added noise, which is less than 1, because the measured tensors already contain noise."""
 _FLOOR = 0.01
 """The least eigenvalue of corrected indefinite tensors, relative to the mean eigenvalue without added noise."""
 _LOUD = 3.0
@@ -123,7 +123,7 @@ def uncertainty(
         progress: a function that is called with a short text after every four maps.
         checkpoint: a file that is written after every four maps. If the file exists, resampling continues.
         each: a function that is called with each sample of the noise of the value, three times for four maps, for
-            example to compute covariances or errors of means. It is not called for samples of a checkpoint.
+            example to compute covariances or errors of means. Samples in a checkpoint are not passed to it again.
 
     Returns:
         The value with its standard deviation, its bias and their accuracy. Under `jit`, `method` must not be

@@ -35,7 +35,7 @@ class Uncertainty(eqx.Module):
         sampling_error: the relative standard deviation of ``deviation``; 0 if ``deviation`` is exact to first order.
         method: ``"resample"``, ``"linear"`` or ``"exact"``.
         draws: the number of maps of noisy tensors that were computed.
-        freedom: the degrees of freedom of ``deviation``, which include those of the noise; infinite if it is exact.
+        freedom: the degrees of freedom of ``deviation``, limited by `TensorNoise.freedom`; infinite if it is exact.
         samples: the degrees of freedom of ``beyond_linear``.
     """
 

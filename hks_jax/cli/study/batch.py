@@ -217,7 +217,7 @@ def _suitable(
 
 
 Range = tuple[float, float]
-"""The least and the largest time that suit a subject. Voxels and eigenpairs limit the least, the size the largest."""
+"""For a subject, the least time, which voxels and eigenpairs limit, and the largest time, which the size limits."""
 
 
 def suitable_range(volume: TensorVolume, args: argparse.Namespace) -> Range:

@@ -58,7 +58,7 @@ def explore(
             all values must be finite. The normalisations ``"raw"`` and ``"flat"`` are shown as (4πt)^(d/2)·HKS, which
             is 1 for flat space without boundary, with colours that diverge from 1. With the standard deviations
             ``arrays["deviation"]``, curves of points have a band, and values fade if noise explains their difference
-            from flat space or from the mean. Tensors, if known, give the mean eigenvalue, anisotropy and direction
+            from flat space or from the mean. Tensors, if known, appear as mean eigenvalue, anisotropy and direction
             (red, green and blue for x, y and z). With an affine, positions are shown in space, and the sides of images
             have the letters L and R, P and A, I and S. For the metric D⁻¹, the distance √(Dt) is shown beside t.
         path: the file of the page; its folder is created.
@@ -202,7 +202,7 @@ def _regions(
 
 
 def _in_space(result: Result) -> dict[str, Any]:
-    """Return the matrix from indices to positions in space, and the letters of the grid's sides, if they are known."""
+    """Return the matrix from indices to space and the letters of the grid's sides; both are None without an affine."""
     volume = result.place
     if not isinstance(volume, TensorVolume) or volume.affine is None:
         return {"world": None, "ends": None}
