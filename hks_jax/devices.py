@@ -70,27 +70,28 @@ def heat_columns(
     tolerance: float = 1e-8,
     degree: int | None = None,
 ) -> Float[Array, "n_times *padded b"]:
-    """Return exp(−tD⁻¹K) x for each time t and column x. Columns x = D⁻¹eᵢ give columns of the heat kernel.
+    """Return exp(−tD⁻¹K) x for each time t and column x, where K is the stiffness and D is the lumped mass.
 
-    Use this function for fields that exceed the memory of one device. Each degree of the Chebyshev expansion takes one
-    product with K; for this product, neighbouring devices exchange one plane of nodes. All times use the same products.
+    If x is D⁻¹ times a unit vector, the result is a column of the heat kernel. Use this function for fields that exceed
+    the memory of one device. Each degree of the Chebyshev expansion takes one product with K; for this product,
+    neighbouring devices exchange one plane of nodes. All times use the same products.
 
     Args:
         slabs: the partition of the grid.
         stiffness: the stiffness matrix K, ``slabs.split(pencil.stiffness.coefficients, 1)``.
         lumped: the row sums D of the mass matrix, ``slabs.split(...)``; 0 at nodes that are not free.
-        columns: nodal values x; the last axis is the index of the column. ``slabs.split(...)`` makes them.
-        times: (n_times,), nonnegative.
+        columns: nodal values x; the last axis is the index of the column. ``slabs.split(...)`` makes this array.
+        times: (n_times,) nonnegative times.
         tolerance: a bound on the truncation error of the expansion, relative to the columns, in the norm of D.
-        degree: the degree of the polynomial, by default the least that satisfies the tolerance. Required for traced
-            arrays.
+        degree: the degree of the polynomial, by default the least that satisfies the tolerance. If arrays are traced,
+            this argument is required.
 
     Returns:
         Values in the layout of the columns. ``slabs.join(result, 1)`` removes the padding.
 
     Raises:
-        ValueError: if arrays are not from `Slabs.split`, if times or tolerance are invalid, or if traced arrays lack a
-            degree.
+        ValueError: if arrays are not from `Slabs.split`, if times or tolerance are invalid, or if arrays are traced and
+            the degree is None.
 
     Examples:
         >>> slabs = hj.devices.Slabs(jax.make_mesh((1,), ("devices",)), (9, 9), (False, False))
@@ -131,8 +132,8 @@ def chebyshev_series(
 ) -> Float[Array, "m *padded b"]:
     """Return Σₙ cₘₙ Tₙ(2D⁻¹K/top − 1) x for each column x, where c is the series and Tₙ are Chebyshev polynomials.
 
-    The number ``top`` is an upper bound of the spectrum of D⁻¹K. The series has at least two terms. The arrays have the
-    layout of `heat_columns`. The result is linear in the series and in the columns, and differentiable.
+    The number ``top`` is an upper bound of the spectrum of D⁻¹K. The series has at least two terms. K, D and the layout
+    of the arrays are as in `heat_columns`. The result is linear in the series and in the columns, and differentiable.
 
     Examples:
         >>> slabs = hj.devices.Slabs(jax.make_mesh((1,), ("devices",)), (9, 9), (False, False))
@@ -159,5 +160,5 @@ def chebyshev_series(
 
 
 def _inverse(lumped: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Return D⁻¹ with 0 at nodes that are not free."""
+    """Return the inverse of the lumped mass, with 0 at nodes that are not free."""
     return jnp.where(lumped > 0, 1 / jnp.where(lumped > 0, lumped, 1), 0)

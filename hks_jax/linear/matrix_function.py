@@ -17,7 +17,7 @@ from hks_jax.linear.products import matmul
 
 Matrix = Float[Array, "n n"]
 Function = Callable[[Any, Any, Array], Array]
-"""f(parameters, others, x), elementwise in x. ``parameters`` is a pytree of real arrays, and ``others`` of the other
+"""f(parameters, others, x), elementwise in x. ``parameters`` is a pytree of real arrays; ``others`` is one of other
 arrays."""
 
 
@@ -145,7 +145,7 @@ def _table(f: Callable[[Array], Array], values: Float[Array, " n"]) -> Matrix:
 
 
 def _table_along(f: Function, parameters: Any, others: Any, values: Float[Array, " n"], change: Any) -> Matrix:
-    """Return [∂f]. It is linear in the change, because whether `_table` uses a mean or a quotient depends only on f."""
+    """Return [∂f], which is linear in the change: whether `_table` uses a mean or a quotient depends only on f."""
     return jax.jvp(lambda p: _table(partial(f, p, others), values), (parameters,), (change,))[1]
 
 
@@ -166,6 +166,6 @@ def _mixed(f: Callable[[Array], Array], values: Float[Array, " n"], table: Matri
 
 
 def _compose(vectors: Matrix, inner: Matrix) -> Matrix:
-    """Return the symmetric part of V X Vᵀ."""
+    """Return the symmetric part of V X Vᵀ, where V are the eigenvectors and X is ``inner``."""
     full = matmul(vectors, inner, vectors.T)
     return (full + full.T) / 2

@@ -75,15 +75,15 @@ class Trial(NamedTuple):
 
 
 # If the shift is an eigenvalue of a part of the domain, a pivot vanishes. A pivot δ causes Schur complements of size
-# 1/δ and, with the explicit inverses of the next front, errors of ε/δ². Replacing it by the least allowed pivot
-# perturbs the matrix by at most twice that pivot. Both errors balance near ε^(1/3), which bounds the error of every
-# factorisation (static pivoting, Li and Demmel 1998). In measurements, ε^(3/8) is best for counts. Solves need more
-# accuracy, and small pivots may be harmless, as on a thin domain or with a nearly decoupled component.
+# 1/δ and, with the explicit inverses of the next front, errors of ε/δ². Replacing δ by the least allowed pivot perturbs
+# the matrix by at most twice that pivot. Both errors balance if the least pivot is near ε^(1/3), which bounds the error
+# of every factorisation (static pivoting, Li and Demmel 1998). In measurements, ε^(3/8) is best for counts. Solves need
+# more accuracy, and small pivots may be harmless, as on a thin domain or with a nearly decoupled component.
 def factorise(dissection: Dissection, matrix: Float[Array, " m"], least: Scalar | None = None) -> Factorisation:
     """Factorise a symmetric matrix, without pivoting between fronts; `try_out` measures the accuracy.
 
     The matrix is given by its entries at the places of the pattern, as from `SymmetricPencil.shifted`. Pivots smaller
-    than ``least``, relative to the entries of the front, are replaced by it.
+    than ``least``, relative to the entries of the front, are replaced by ±``least``.
     """
     return Factorisation(dissection, *_eliminate(dissection, matrix, least))
 
@@ -118,7 +118,8 @@ def try_out(factor: Factorisation, pencil: SymmetricPencil, shift: Scalar, b: Fl
 
 def _error(x: Float[Array, "n b"], image: Float[Array, "n b"], residual: Float[Array, "n b"]) -> Scalar:
     """Return `Trial.error`, given solutions x, Mx, and residuals."""
-    # Solutions are dominated by the eigenvector nearest to the shift, so the error is measured on orthonormal vectors.
+    # Solutions are dominated by the eigenvector nearest to the shift, so the error is measured on orthonormal
+    # combinations.
     products = gram(x, image)
     norms = jnp.sqrt(jnp.diagonal(products))
     # For such a small matrix, the inverse is accurate enough and faster than a long triangular solve.
@@ -131,7 +132,7 @@ def _error(x: Float[Array, "n b"], image: Float[Array, "n b"], residual: Float[A
 def _eliminate(
     dissection: Dissection, matrix: Float[Array, " m"], least: Scalar | None
 ) -> tuple[Blocks, Blocks, Float[Array, " pivots"]]:
-    """Return the matrices downward and upward, and the pivots."""
+    """Return ``downward``, ``upward`` and ``pivots`` of `Factorisation`."""
     pivots = []
 
     def inverted(blocks: Array, sizes: Array) -> Array:
@@ -200,7 +201,7 @@ def eliminate(
 def _substituted(
     levels: tuple[Level, ...], downward: Blocks, upward: Blocks, rhs: Float[Array, "n b"]
 ) -> tuple[Float[Array, "m b"], Float[Array, "fronts r b"]]:
-    """Solve along levels, with x = 0 at the boundary of the first; return x at own nodes, and the boundary residual."""
+    """Solve along levels; x = 0 at the boundary of the first. Return x at own nodes, and the boundary residual."""
     width = rhs.shape[1]
     own: list[Array] = []
     passed: Array | None = None

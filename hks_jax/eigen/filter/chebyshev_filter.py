@@ -37,7 +37,7 @@ _SPARE = 0.35
 _LEAST_NODES = 6
 """The least number of nodes along each axis at which a grid is coarsened."""
 _LARGE = 1 << 21
-"""The total number of entries of the vectors above which progress is reported after each block, not only each round."""
+"""The total number of entries of the vectors above which every block reports progress, not only every round."""
 
 Pairs = tuple[Float[Array, " k"], Float[Array, "k n_dof"]]
 
@@ -48,8 +48,8 @@ class ChebyshevFilter(Eigensolver[Pencil]):
     The solver is for grids, mainly in 3D, where factorisations have much fill-in, and for accelerators. Filters run in
     single precision without loss of accuracy, because they act on residuals that are computed in the precision of the
     matrices. All pairs are computed simultaneously, so that multiple eigenvalues are complete; but no certificate shows
-    that none was missed. The solver works under `jit`. Outside `jit`, it can be interrupted and reports progress
-    between two rounds.
+    that no eigenvalue was missed. The solver works under `jit`. Outside `jit`, it can be interrupted and reports
+    progress between two rounds.
 
     Attributes:
         tolerance: the relative residual at which a pair counts as converged.

@@ -30,7 +30,7 @@ _TOLD = 25
 
 
 class ShiftInvert(Eigensolver[Pencil]):
-    """ARPACK's Lanczos (`scipy.sparse.linalg.eigsh`) on (K + sM)⁻¹M, factorised by SuperLU, in float64 on the host.
+    """ARPACK's Lanczos (`scipy.sparse.linalg.eigsh`) on (K + sM)⁻¹M for some s > 0, by SuperLU in float64 on the host.
 
     The inertia of a second factorisation checks that no eigenvalue below the last was missed. Under `jit` and `vmap`,
     the solver runs in a host callback, one problem at a time. Outside `jit`, it can be interrupted, and reports
@@ -39,7 +39,8 @@ class ShiftInvert(Eigensolver[Pencil]):
     Attributes:
         tolerance: the relative residual at which a pair counts as converged; ARPACK itself runs to machine precision.
         max_restarts: the maximal number of implicit restarts.
-        basis: the size of the Lanczos basis, more than k (for derivatives, more than 9 + k + k/20). None is 2k + 20.
+        basis: the size of the Lanczos basis; None is 2k + 20. The size is raised if it is not more than the number of
+            pairs, which for derivatives includes guard pairs.
 
     Examples:
         >>> sparse = hj.eigenpairs(field, k=12, solver=hj.ShiftInvert(basis=30))
@@ -128,7 +129,7 @@ class ShiftInvert(Eigensolver[Pencil]):
             vectors = np.concatenate([vectors, others], axis=1)[:, order]
             # Lanczos with single vectors can miss pairs of a multiple eigenvalue. By Sylvester's law of inertia, the
             # negative pivots of K − σM count the eigenvalues below σ. If pairs are missing, search again, orthogonally
-            # to the others.
+            # to the pairs found.
             below = values[-1] - 1e-6 * max(values[-1], shift)
             if below <= 0:  # only null vectors
                 return _padded(values, vectors, k, max(below, 0.0))

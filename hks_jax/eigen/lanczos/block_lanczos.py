@@ -24,7 +24,8 @@ from hks_jax.linear.pencil import SymmetricPencil, tabulated
 from hks_jax.traced import is_traced
 
 SLICE = 170
-"""The number of eigenvalues per slice. Smaller slices take more factorisations, larger ones more orthogonalisation."""
+"""The number of eigenvalues per slice. Small slices take more factorisations; large slices take more
+orthogonalisation."""
 _DENSE = 3000
 """The largest number of unknowns for which the dense solver takes over if slicing fails."""
 
@@ -95,7 +96,7 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
 
 
 def known_by_weyl(pencil: SymmetricPencil) -> bool:
-    """Return whether Weyl's law predicts where the spectrum begins and its density; otherwise inertia is needed."""
+    """Return whether Weyl's law predicts the beginning and density of the spectrum; otherwise inertia is needed."""
     return isinstance(pencil, Pencil) and pencil.measured and pencil.null_space is not None
 
 
