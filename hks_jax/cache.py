@@ -36,7 +36,7 @@ def keep_compiled(folder: str | os.PathLike[str] | None = None) -> Path | None:
     if not os.access(path, os.W_OK):
         return None
     jax.config.update("jax_compilation_cache_dir", str(path))
-    # By default, JAX stores only programs whose compilation takes at least a second. Reading a program is ten times as
-    # fast as compiling it.
+    # By default, JAX stores only programs whose compilation takes at least a second. Reading is ten times as fast as
+    # compiling.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     return path

@@ -52,8 +52,7 @@ def map_fields(function: Callable[[Any], Any], batch: Any, mesh: Mesh) -> Any:
 @partial(jax.jit, static_argnames=("function", "mesh"))
 def _map(function: Callable[[Any], Any], batch: Any, mesh: Mesh) -> Any:
     n, spec = jax.tree.leaves(batch)[0].shape[0], PartitionSpec(mesh.axis_names[0])
-    # The batch is padded with copies of its last entry, because for zeros the function might return NaN or not
-    # terminate.
+    # Padding copies the last entry, because for zeros the function might return NaN or not terminate.
     filled = jax.tree.map(lambda x: x[jnp.minimum(jnp.arange(-(-n // mesh.size) * mesh.size), n - 1)], batch)
     share = jax.shard_map(
         lambda own: jax.lax.map(function, own), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
@@ -83,15 +82,15 @@ def heat_columns(
         columns: nodal values x; the last axis is the index of the column. ``slabs.split(...)`` makes this array.
         times: (n_times,) nonnegative times.
         tolerance: a bound on the truncation error of the expansion, relative to the columns, in the norm of D.
-        degree: the degree of the polynomial, by default the least that satisfies the tolerance. If arrays are traced,
-            this argument is required.
+        degree: the polynomial's degree, by default the least that satisfies the tolerance; required if arrays are
+            traced.
 
     Returns:
         Values in the layout of the columns. ``slabs.join(result, 1)`` removes the padding.
 
     Raises:
-        ValueError: if arrays are not from `Slabs.split`, if times or tolerance are invalid, or if arrays are traced and
-            the degree is None.
+        ValueError: arrays are not from `Slabs.split`, times or tolerance are invalid, or arrays are traced without a
+            degree.
 
     Examples:
         >>> slabs = hj.devices.Slabs(jax.make_mesh((1,), ("devices",)), (9, 9), (False, False))

@@ -60,8 +60,7 @@ def solved(
 # on the M-orthogonal complement of the computed eigenvectors Φ. On this complement, K − λᵢM is positive definite.
 # Reverse mode uses the symmetry of the map fᵢ ↦ xᵢ. The solver computes some guard pairs beyond k, so that λᵢ is not
 # close to the eigenvalues on the complement. In the interior of a spectrum, the complement has eigenvalues on both
-# sides of λᵢ. So there are guards on both sides: at most half of the guards lie below the origin, and the others follow
-# the k pairs.
+# sides of λᵢ. So guards lie on both sides: at most half of them below the origin, and the others after the k pairs.
 #
 # If λᵢ = λⱼ and j ≠ i, the coefficient of φⱼ in dφᵢ is arbitrary (a gauge), because every basis of the eigenspace is
 # valid. The rule sets this coefficient to −½ φⱼᵀ dM φᵢ, which keeps Φ M-orthonormal and is never NaN. The rule does the
@@ -158,8 +157,7 @@ def _numpy_rule(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> A
 
 
 def change_of(change: SymmetricPencil, x: Rows, *p: Rows) -> SymmetricPencil:
-    """Return the cotangent of a pencil: Σᵢ pᵢxᵢᵀ, where the first p is for the stiffness and the second for the
-    mass."""
+    """Return a pencil's cotangent Σᵢ pᵢxᵢᵀ, where the first p is for the stiffness and the second is for the mass."""
     zeros = jax.tree.map(lambda like: jax.device_put(np.zeros(like.shape, like.dtype)), change)
     matrices = tuple(matrix.outer(each, x) for matrix, each in zip((zeros.stiffness, zeros.mass), p, strict=True))
     return eqx.tree_at(lambda pencil: (pencil.stiffness, pencil.mass), zeros, matrices)
@@ -247,8 +245,7 @@ def _checked(on_failure: OnFailure, x: Rows) -> Rows:
 def _with_null_modes(xp: Any, mass: Any, nulls: Any, values: Any, vectors: Any) -> tuple[Any, Any]:
     """Replace the solver's approximations of null vectors by the pencil's null vectors.
 
-    The eigenvalue of a null vector becomes exactly 0 instead of about ±1e-13. Other vectors become orthogonal to the
-    null vectors.
+    The eigenvalues of null vectors become 0 instead of about ±1e-13. Other vectors become orthogonal to null vectors.
     """
     product: Any
     inverse_cholesky: Any
@@ -274,8 +271,8 @@ def _with_null_modes(xp: Any, mass: Any, nulls: Any, values: Any, vectors: Any) 
 def frame_of_chosen(vectors: Rows, mass: Operator, chosen: Bool[Array, " k"]) -> Rows:
     """Return the vectors, with a derivative that excludes rotations of the chosen vectors among themselves.
 
-    The result is a frame of the chosen vectors. A frame of all vectors would also exclude rotations towards vectors
-    that are not chosen.
+    The result is a frame of the chosen vectors. A frame of all vectors would also exclude rotations towards other
+    vectors.
     """
     return vectors
 

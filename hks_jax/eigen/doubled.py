@@ -23,10 +23,9 @@ def solve_doubled(
 ) -> Eigenpairs:
     """Solve all parts and return the k lowest pairs of the merged spectrum; ``extra`` = 1 adds the next eigenvalue.
 
-    The number of pairs that each part contributes is not known beforehand. For traced values, each part computes the
-    upper bound from `_limits`. For concrete values, each part begins with an equal share plus a margin, and doubles its
-    number while a pair may be missing. By Weyl's law, boundary conditions change a part's share by about the square
-    root of the total.
+    For traced values, each part computes the largest number of pairs that it may contribute (`_limits`). For concrete
+    values, each part begins with an equal share plus a margin, and doubles this number while a pair may be missing. By
+    Weyl's law, boundary conditions change a part's share by about the square root of the total.
     """
     parts, total = pencil.parts, k + extra
     whole, limits = widened(pencil, solvers, total), _limits(pencil, total)

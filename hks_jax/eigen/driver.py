@@ -52,9 +52,9 @@ def eigenpairs(
             ``"dense"``, ``"shift-invert"`` (on the host), ``"block-lanczos"`` (mainly for 2D and surfaces),
             ``"chebyshev-filter"`` (for grids, mainly in 3D), or a solver object such as
             ``hks_jax.BlockLanczos(tolerance=1e-6)``. The result names the solver in ``.solver_name``. An interval, or a
-            stiffness that may be indefinite, needs ``"dense"`` or ``"block-lanczos"``. If its values are concrete, an
-            indefinite stiffness may also use ``"shift-invert"``. For an interval, derivatives use only the tolerance of
-            the solver's ``adjoint``.
+            stiffness that may be indefinite, needs ``"dense"`` or ``"block-lanczos"``. For an indefinite stiffness with
+            concrete values, ``"shift-invert"`` works too. For an interval, derivatives use only the tolerance of the
+            solver's ``adjoint``.
         mass: ``"consistent"`` or ``"lumped"``. This argument applies only to fields and meshes.
         multiplet: the treatment of a multiple eigenvalue of which only some pairs are among the k lowest; unused with
             an interval. ``"report"`` warns. ``"drop"`` excludes these pairs from every signature. ``"complete"``

@@ -47,16 +47,14 @@ class Eigenpairs(eqx.Module):
         eigenvalues: (k,) in ascending order, in 1/(metric length)²; exactly 0 for null vectors.
         vectors: (k, n_dof) coefficients of the eigenfunctions, with φᵢᵀMφⱼ = δᵢⱼ. For the boundaries "mirror" and
             "mean", M is that of the doubled domain; so each doubling divides the norm on the domain itself by √2.
-        frame: (k, n_dof) the values of `vectors`, but with a derivative that excludes rotations of the eigenfunctions
-            among themselves. The derivatives of such rotations are singular at multiple eigenvalues, and irrelevant to
-            signatures.
+        frame: (k, n_dof) the values of `vectors`, but with a derivative that excludes rotations of eigenfunctions among
+            themselves. Such rotations are singular at multiple eigenvalues, and do not affect signatures.
         residuals: (k,) ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁), where λ₁ is the first positive eigenvalue. In an interval, or if
             the null space is unknown, max(λ, λ₁) is replaced by the larger of two numbers: the mean gap of the
             eigenvalues, and the distance of λ from `spectral_origin`.
         converged: (k,) whether the residual is at most the solver's tolerance, or at most the level of rounding.
         kept: (k,) whether each pair belongs to the truncated spectrum; signatures ignore the other pairs.
-            ``multiplet="drop"`` and ``"complete"`` may exclude the last pairs; `of_part` excludes the pairs of other
-            parts.
+            ``multiplet="drop"`` and ``"complete"`` may exclude the last pairs; `of_part` excludes other parts.
         part: (k,) for the boundaries "mirror" and "mean", the index of the pencil's part that each pair belongs to (0
             is the Neumann problem); otherwise None.
         next_eigenvalue: the first eigenvalue that is not kept; infinite if it does not exist or was not computed, as
@@ -171,7 +169,7 @@ class Eigenpairs(eqx.Module):
 
     @property
     def result(self) -> RESULTS:
-        """The most serious failure, as a traceable code; compare it with ``RESULTS.successful`` or call its
+        """The most serious failure, a traceable code. Compare it with ``RESULTS.successful``, or call its
         ``error_if``."""
         finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(self.pencil) if eqx.is_inexact_array(leaf)]
         code: Any = RESULTS  # mypy sees its members as strings

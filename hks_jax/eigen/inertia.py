@@ -31,7 +31,8 @@ _BESIDE = (1e-6, 1e-5, 1e-4, 1e-3)
 _TRIES = 60
 """The maximal number of factorisations in a search."""
 _JUST_BELOW = 0.625
-"""The first shift is −ε to this power, times an estimate of the largest eigenvalue: accurate even if K is singular."""
+"""The exponent p of the first shift, −ε^p times the largest eigenvalue. Counts there are accurate even for singular
+K."""
 _ALIKE = 1e-3
 """The relative width of a bracket below which all eigenvalues in it count as one multiple eigenvalue."""
 _NARROW = 8
@@ -52,8 +53,8 @@ def count_eigenvalues(
     By Sylvester's law of inertia, the number of eigenvalues below σ is the number of negative eigenvalues of K − σM,
     which a factorisation LDLᵀ shows. So one factorisation certifies that a list of eigenvalues is complete. Random
     right-hand sides test whether the error of the factorisation could change its inertia. If σ is an eigenvalue of the
-    domain or of a part of the domain, the error may be too large; then the function counts on both sides of σ. It works
-    under `jit`.
+    domain or of a part of the domain, the error may be too large; then the function counts on both sides of σ. The
+    function works under `jit`.
 
     Args:
         domain: a tensor field, a mesh, a pencil, K, or (K, M), as in `eigenpairs`.

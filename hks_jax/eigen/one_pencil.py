@@ -68,8 +68,7 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
         origin, first, below = locate(jax.lax.stop_gradient(pencil), half, solver.block)
         reach, spacing = first - origin, (first - origin) / jnp.maximum(below, 1).astype(origin.dtype)
         if not is_traced(below) and below > 2 * half:
-            # The lowest eigenvalue has a higher multiplicity than expected. Compute all its pairs, because `locate`
-            # counted them.
+            # The lowest eigenvalue has an unexpectedly high multiplicity. Compute all pairs that `locate` counted.
             number = max(k, int(below))
             method = solver if number + 1 <= solver.max_pairs(n_dof) else Dense(solver.tolerance)
 
@@ -208,8 +207,8 @@ def _quality(
     """Return residuals, convergence flags, flags of zero eigenvalues, and the multiplet tolerance.
 
     Residuals are relative to the distance of the eigenvalue from the origin. This distance is bounded below by the
-    first positive eigenvalue if the null space is known, otherwise by the mean gap; if all eigenvalues are zero, by
-    `largest_of` the pencil.
+    first positive eigenvalue if the null space is known, by `largest_of` if all eigenvalues are zero, and otherwise by
+    the mean gap.
     """
     measure = measured_on_host if xp is np else measure_pairs
     (_, residuals, twice), k = measure(pencil, vectors, values), values.size

@@ -75,16 +75,14 @@ def allowed_residuals(scale: Any, rounding: Any, tolerance: float, xp: Any = jnp
 
 
 def indistinct(pencil: SymmetricPencil, dtype: np.dtype) -> Float[Array, ""]:
-    """Return 4 ε times the `largest` eigenvalue. At smaller distances, eigenvalues are equal within the rounding of
-    K."""
+    """Return 4 ε times the `largest` eigenvalue. Eigenvalues at a smaller distance are equal within rounding."""
     return 4 * jnp.finfo(dtype).eps * largest(pencil)
 
 
 def largest(pencil: SymmetricPencil) -> Float[Array, ""]:
     """Estimate the largest eigenvalue by 4·max|Kᵢᵢ/Mᵢᵢ|, which is exact on a uniform grid in 2D and 3D.
 
-    If this number is smaller than the mean over i of Σⱼ|Kᵢⱼ|, divided by max Mᵢᵢ, the estimate is that mean. This is so
-    for adjacency matrices, whose diagonal is small.
+    The estimate is at least the mean over i of Σⱼ|Kᵢⱼ|, divided by max Mᵢᵢ, in case the diagonal of K is small.
     """
     return _largest(pencil.stiffness, pencil.mass)
 

@@ -136,8 +136,7 @@ def _combined(
     wanted: int,
     name: str,
 ) -> tuple[tuple[Block, ...], Small]:
-    """Return combinations of blocks, and a matrix; ``small`` computes coefficients and matrix from the sum of
-    ``parts``."""
+    """Return combinations of blocks, and a matrix; ``small`` computes coefficients and matrix from the summed parts."""
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 

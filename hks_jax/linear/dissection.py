@@ -30,8 +30,7 @@ Ints = Int[np.ndarray, " _"]
 
 
 class Level(NamedTuple):
-    """The fronts of one level. A front eliminates s own nodes. Its r boundary nodes are coupled to it and eliminated
-    later.
+    """The fronts of one level. A front eliminates s own nodes; r boundary nodes coupled to it are eliminated later.
 
     In smaller fronts, indices are padded with the first number that is out of range.
     """

@@ -75,8 +75,7 @@ class FactorisedMatrix(eqx.Module):
 
     @property
     def inertia(self) -> Inertia:
-        """The numbers of negative and positive eigenvalues; for A = K − σM, of the pencil's eigenvalues below and above
-        σ."""
+        """The numbers of negative and positive eigenvalues; for A = K − σM, of the pencil's eigenvalues < σ and > σ."""
         negative = self.factor.negative
         counts = negative, jnp.asarray(self.size, negative.dtype) - negative
         return Inertia(*(jnp.where(self.sound, count, -1) for count in counts))
@@ -258,8 +257,8 @@ def _eliminated(matrix: Float[Array, " m"], factor: Factorisation) -> Eliminated
 
 
 # Only some entries of d(A⁻¹) = −A⁻¹ dA A⁻¹ are needed. The rule differentiates the elimination and the recurrence from
-# the first separator to the cells; its transpose takes a few times as many operations. The values are computed from the
-# given factors.
+# the first separator to the cells; its transpose takes a few times as many operations. The values come from the
+# factors.
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _inverse(diagonal: bool, matrix: Float[Array, " m"], factor: Factorisation) -> Float[Array, " n"]:
     return selected(factor.dissection, _eliminated(matrix, factor), diagonal)

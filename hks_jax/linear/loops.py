@@ -1,6 +1,6 @@
 """Loops that run in Python for concrete values, where they can be interrupted, and in XLA for traced values.
 
-On CPUs, a batch of problems is also a loop, because solving the problems together is not faster.
+On CPUs, a batch of problems is also solved in a loop, because solving the problems together is not faster.
 """
 
 import contextlib

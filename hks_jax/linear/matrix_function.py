@@ -17,8 +17,8 @@ from hks_jax.linear.products import matmul
 
 Matrix = Float[Array, "n n"]
 Function = Callable[[Any, Any, Array], Array]
-"""f(parameters, others, x), elementwise in x. ``parameters`` is a pytree of real arrays; ``others`` is one of other
-arrays."""
+"""f(parameters, others, x), elementwise in x. The pytree ``parameters`` has all real arrays; ``others`` has the
+rest."""
 
 
 def matrix_function(A: Any, f: Callable[[Array], Any], B: Any = None) -> Float[Array, "n n"]:

@@ -1,8 +1,8 @@
 """The multifrontal LDLᵀ factorisation of K − σM, for linear solves, and for eigenvalue counts by its inertia.
 
 The computation is batched dense algebra, with one batch for each level of the nested dissection. In 2D, a factorisation
-takes O(N^1.5) operations and a solve O(N log N), in O(log N) sequential steps. The same code runs on every device,
-under `jit` and `vmap`.
+takes O(N^1.5) operations and a solve O(N log N), in O(log N) sequential steps. The code runs on every device, under
+`jit` and `vmap`.
 """
 
 import math
@@ -118,8 +118,7 @@ def try_out(factor: Factorisation, pencil: SymmetricPencil, shift: Scalar, b: Fl
 
 def _error(x: Float[Array, "n b"], image: Float[Array, "n b"], residual: Float[Array, "n b"]) -> Scalar:
     """Return `Trial.error`, given solutions x, Mx, and residuals."""
-    # Solutions are dominated by the eigenvector nearest to the shift, so the error is measured on orthonormal
-    # combinations.
+    # Solutions are dominated by the eigenvector nearest to the shift, so errors are measured on orthonormal vectors.
     products = gram(x, image)
     norms = jnp.sqrt(jnp.diagonal(products))
     # For such a small matrix, the inverse is accurate enough and faster than a long triangular solve.

@@ -27,7 +27,7 @@ Eliminated = list[tuple[Inexact[Array, "_fronts _s _s"], Inexact[Array, "_fronts
 def inverse_entries(
     dissection: Dissection, matrix: Inexact[Array, " m"], diagonal: bool = True
 ) -> Inexact[Array, " entries"]:
-    """Eliminate a symmetric matrix, real or complex (not Hermitian), and return the entries `selected` of its inverse.
+    """Eliminate a symmetric matrix, real or complex (not Hermitian), and return `selected` entries of its inverse.
 
     The elimination does not pivot between fronts. This is safe if the real or imaginary part of the matrix is definite,
     because then no Schur complement is singular. The function is differentiable in both modes; reverse mode stores

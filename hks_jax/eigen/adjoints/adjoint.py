@@ -50,8 +50,7 @@ _ROWS = 128
 class Adjoint(eqx.Module, Generic[P]):
     """A linear solver with K − λᵢM on the complement of the computed eigenvectors; all settings are static.
 
-    Every eigensolver has a default in its field ``adjoint``; any other `Adjoint` that supports the pencil may replace
-    it.
+    The field ``adjoint`` of each eigensolver has a default; any `Adjoint` that supports the pencil may replace it.
 
     Attributes:
         tolerance: the wanted error in the energy norm, relative to the largest row. Because of the rounding errors of

@@ -132,8 +132,8 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         return complement.amplification(values, k)
 
     # If r has a component along φⱼ by rounding, (K − λᵢM)(K − σM)⁻¹ multiplies it by (λⱼ − λᵢ)/(λⱼ − σ). This factor is
-    # large mainly for λⱼ near σ. So each step projects out only these φⱼ; the other φⱼ are projected out at the end or
-    # at a restart.
+    # large mainly for λⱼ near σ. So each step projects out only these φⱼ; the other φⱼ are projected out at restarts
+    # and at the end.
     def _solve_block(
         self, pencil: Any, values: Values, without_near: OfColumns, without_known: OfColumns, *of_block: Any
     ) -> Columns:
@@ -197,8 +197,7 @@ class InteriorAdjoint(FactorisedAdjoint):
         def product(x: Columns) -> tuple[Columns, Float[Array, " b"]]:
             return factor.solve(stiffness(x) - shifts * mass(x)), complement.SINGULAR * inner(x, x)
 
-        # Rounding leaves components along computed eigenvectors. A amplifies only components whose eigenvalue is near
-        # σ.
+        # Rounding leaves components along computed eigenvectors. A amplifies only components with λⱼ near σ.
         right = factor.solve(b)
         return conjugate_gradients(product, without_near, right, wanted, inner, without_known).converged
 

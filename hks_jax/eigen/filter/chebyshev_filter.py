@@ -177,8 +177,8 @@ class Pace:
         if not self._factor > 1 or not self._excess > 1:
             return None
         rounds = math.ceil(math.log(self._excess) / math.log(self._factor))
-        # Later rounds filter fewer pairs. So if the work of this round is known, it is a better estimate than the work
-        # of the last round.
+        # Later rounds filter fewer pairs. So the work of this round, if known, is a better estimate than that of the
+        # last round.
         return (rounds - done / self._work) * self._seconds * self._work / self._last_work
 
 

@@ -65,8 +65,7 @@ class FilteredAdjoint(Adjoint[Pencil]):
         mass = space.restrict(nodal.lumped)
         quotients = values / jax.lax.map(lambda phi: jnp.sum(mass * phi * phi), vectors, batch_size=self.block)
         band = Band(jnp.minimum(jnp.max(quotients) * (1 + 1 / values.size), _WIDEST * high), high)
-        # At values nearer to the band, the polynomial would not reach its gain, and the preconditioner might not be
-        # definite.
+        # Nearer to the band, the polynomial would not reach its gain, and the preconditioner might be indefinite.
         nearest = (math.cosh(math.acosh(_GAIN) / _MOST_DEGREE) - 1) / 2
         quotients = jnp.minimum(quotients, band.low - nearest * (band.high - band.low))
         clean = complement.without_known(pencil, vectors)

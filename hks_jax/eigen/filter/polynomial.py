@@ -35,16 +35,14 @@ class Band(NamedTuple):
 
 
 # Let x be an approximate eigenvector with Rayleigh quotient λ and residual r = Kx − λMx. Let p be the Chebyshev
-# polynomial with |p| ≤ 1 on the band, which grows fast below the band. Applying p(M⁻¹K)/p(λ) to x gives x plus a
-# correction,
+# polynomial with |p| ≤ 1 on the band; p grows fast below the band. Then p(M⁻¹K)x/p(λ) is x plus a correction,
 #
 #     x + q(M⁻¹K) M⁻¹r,    q(z) = (p(z)/p(λ) − 1)/(z − λ),
 #
 # in which M⁻¹ acts only on the residual. So an approximate inverse, or single precision, does not change the limit
 # (residual-based filtering, R-ChFSI). Let the lumped mass D replace M. For a mode of eigenvalue μ on which D⁻¹M is the
-# factor β < 1, z becomes βμ, and the coefficient in D⁻¹r is β(μ − λ) instead of z − λ. These numbers agree to second
-# order in h²λ if the lumped quotient ζ = xᵀKx / xᵀDx replaces λ and the correction is scaled by ζ/λ: for β(μ) ≈ 1 −
-# ch²μ,
+# factor β < 1, z becomes βμ, and the coefficient in D⁻¹r is β(μ − λ) instead of z − λ. The two agree to second order in
+# h²λ if the lumped quotient ζ = xᵀKx / xᵀDx replaces λ and the correction is scaled by ζ/λ: for β(μ) ≈ 1 − ch²μ,
 #
 #     z − ζ = (μ − λ)(β − ch²λ + …) = β(μ − λ) · λ/ζ + ….
 #

@@ -59,7 +59,7 @@ class FilterState(NamedTuple):
     vectors: Float[Array, "m nodes"]  # M-orthonormal Ritz vectors; each of several devices has a slab of them
     residuals: Values  # ‖Kx − θMx‖/‖Mx‖
     lumped_values: Values  # xᵀKx / xᵀDx, where D is the lumped mass
-    terms: Number  # the number of further terms in the inverse mass
+    terms: Number  # the number of further terms of the Neumann series
     rounds: Number  # the number of rounds so far on this grid
 
 
@@ -67,7 +67,7 @@ class Filtering(NamedTuple):
     """The polynomials of a round."""
 
     band: Band  # the damped interval
-    terms: Number  # the number of further terms in the inverse mass
+    terms: Number  # the number of further terms of the Neumann series
     degrees: Int[Array, " blocks"]  # the degree for each block; 0 if all its vectors have converged
     values: Values  # the value ψ of each vector, at which its polynomial is 1
     factor: Values  # the factor by which each vector's correction is scaled

@@ -32,9 +32,8 @@ _TOLD = 25
 class ShiftInvert(Eigensolver[Pencil]):
     """ARPACK's Lanczos (`scipy.sparse.linalg.eigsh`) on (K + sM)⁻¹M for some s > 0, by SuperLU in float64 on the host.
 
-    The inertia of a second factorisation checks that no eigenvalue below the last was missed. Under `jit` and `vmap`,
-    the solver runs in a host callback, one problem at a time. Outside `jit`, it can be interrupted, and reports
-    progress.
+    The inertia of a second factorisation checks that no eigenvalue was missed. Under `jit` and `vmap`, the solver runs
+    in a host callback, one problem at a time. Outside `jit`, it can be interrupted, and reports progress.
 
     Attributes:
         tolerance: the relative residual at which a pair counts as converged; ARPACK itself runs to machine precision.
@@ -71,8 +70,7 @@ class ShiftInvert(Eigensolver[Pencil]):
 
         def solve(volume: ArrayLike, *data: ArrayLike) -> tuple[np.ndarray, ...]:
             K, M = matrices(*data)
-            # Any s > 0 makes K + sM positive definite; here s is small relative to Weyl's λ₁ or to a typical
-            # eigenvalue.
+            # K + sM is positive definite for any s > 0; s is small relative to Weyl's λ₁ or a typical eigenvalue.
             if dimension is None or not np.isfinite(volume):
                 shift = 1e-3 * float(np.median(K.diagonal() / M.diagonal()))
             else:
@@ -129,7 +127,7 @@ class ShiftInvert(Eigensolver[Pencil]):
             vectors = np.concatenate([vectors, others], axis=1)[:, order]
             # Lanczos with single vectors can miss pairs of a multiple eigenvalue. By Sylvester's law of inertia, the
             # negative pivots of K − σM count the eigenvalues below σ. If pairs are missing, search again, orthogonally
-            # to the pairs found.
+            # to known pairs.
             below = values[-1] - 1e-6 * max(values[-1], shift)
             if below <= 0:  # only null vectors
                 return _padded(values, vectors, k, max(below, 0.0))

@@ -66,10 +66,9 @@ def write(basis: Basis, block: Block, row: Int[Array, ""]) -> Basis:
 
 
 # One step of shift-invert Lanczos amplifies a block's component along a converged eigenvector 10 to 100 times. So after
-# two steps, rounding errors along the basis V of a block x have grown to components c = VᵀMx of 1e-14 to 1e-9. The sums
-# c need double precision, because their rounding errors would otherwise be as large as c. Single precision suffices to
-# subtract Vc, with an error of 6e-8 c. If c is large, because the shift is close to an eigenvalue, V is used in double
-# precision.
+# two steps, a block x has components c = VᵀMx of 1e-14 to 1e-9 along the basis V, by rounding. The sums c need double
+# precision, because their rounding errors would otherwise be as large as c. Single precision suffices to subtract Vc,
+# with an error of 6e-8 c. If c is large, because the shift is close to an eigenvalue, V is used in double precision.
 def within(basis: Basis, images: Float[Array, "n_dof c"], filled: Int[Array, ""]) -> Float[Array, "n_dof c"]:
     """Return VVᵀMx, the projection of columns x on the first ``filled`` basis vectors V, given ``images`` = Mx."""
     if not isinstance(basis, tuple):

@@ -61,8 +61,8 @@ def block_lanczos(
     M-orthonormal to rounding.
     """
     state, traced = _begin(pencil, start, known, room), is_traced(shifted)
-    # Under `jit`, the loop takes `room` steps: if the number of steps varied within a batch, every iteration would copy
-    # the whole state.
+    # Under `jit`, the loop takes `room` steps. If the number varied within a batch, each iteration would copy the
+    # state.
     steps = room if traced else int(steps)
     if not traced and shifted.passes is not None and int(shifted.passes) == 1:
         shifted = shifted._replace(passes=None)
@@ -99,8 +99,8 @@ def _advance(
 ) -> _Recurrence:
     """Take the steps first to last − 1, or two steps if ``alone``. The blocks begin at row ``offset`` of the basis."""
     # If an eigenvalue is close to the shift, its Ritz value θ may be 1000 times as large as the others. A step
-    # amplifies the rounding error along this eigenvector 1000 times. So in single precision, every step orthogonalises
-    # against the whole basis.
+    # amplifies the rounding error along this eigenvector 1000 times. So in float32, every step orthogonalises against
+    # the whole basis.
     every = 2 if state.block.dtype == jnp.float64 else 1
     two = accelerators.at_hand()
 

@@ -66,8 +66,7 @@ def _consider(
     # shift, repeatedly if necessary.
     too_many = trial.sound & (missing > plan.slice_size) & (below != state.below)
     multiple = trial.sound & (missing > 2 * plan.block) & (below == state.far_below)
-    # If a multiplicity exceeds the wanted number, some of its pairs suffice; the certificate then ends below the
-    # multiplet.
+    # If a multiplicity exceeds the wanted number, some pairs suffice. Then the certificate ends below the multiplet.
     cut = multiple & jnp.isfinite(last)
     lowest = jnp.where(state.reached > 0, state.reached, problem.lowest)
     accurate = state.stuck | (trial.error <= _ERROR * _needed(problem, plan, lowest))
