@@ -31,8 +31,7 @@ _BESIDE = (1e-6, 1e-5, 1e-4, 1e-3)
 _TRIES = 60
 """The maximal number of factorisations in a search."""
 _JUST_BELOW = 0.625
-"""The exponent p of the first shift, −ε^p times the largest eigenvalue. Counts there are accurate even for singular
-K."""
+"""The exponent p of the first shift −ε^p λ of a search, where λ is an estimate of the largest eigenvalue."""
 _ALIKE = 1e-3
 """The relative width of a bracket below which all eigenvalues in it count as one multiple eigenvalue."""
 _NARROW = 8
@@ -169,8 +168,8 @@ class _Descent(NamedTuple):
 def lowered(pencil: LocatedPencil, most: int, probes: int) -> tuple[Scalar, Number]:
     """Return a distance below the origin, and the number of eigenvalues within this distance, from `most`/2 to `most`.
 
-    The number is smaller if no more eigenvalues exist, or if the next eigenvalue is multiple and would make it exceed
-    `most`. Each factorisation is tested with `probes` random right-hand sides.
+    The number is smaller if no more eigenvalues exist, or if the next eigenvalue is multiple and would make the number
+    exceed `most`. Each factorisation is tested with `probes` random right-hand sides.
     """
     count, dtype = _counting(pencil, probes), pencil.stiffness.dtype
 
@@ -219,7 +218,7 @@ def locate(pencil: SymmetricPencil, wanted: int, probes: int) -> tuple[Scalar, S
     """
     size, count = scale(pencil), _counting(pencil, probes)
     infinite = jnp.full((), jnp.inf, size.dtype)
-    # The first shift is just below zero. A singular K ⪰ 0 has no eigenvalue below it, and is factorised accurately.
+    # The first shift is just below zero. There, a singular K ⪰ 0 has the count 0 and an accurate factorisation.
     least = jnp.asarray(float(jnp.finfo(size.dtype).eps) ** _JUST_BELOW, size.dtype) * size
     none = jnp.zeros((), int)
 

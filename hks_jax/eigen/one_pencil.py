@@ -31,7 +31,7 @@ _FAR = 30
 
 
 def widened(pencil: AnyPencil, solvers: Sequence[Eigensolver], k: int) -> AnyPencil:
-    """Return the pencil `on_all_nodes`, so that all masks share one compilation; not for the dense solver."""
+    """Return the pencil `on_all_nodes`, so that masks share one compilation. For the dense solver, return `pencil`."""
     return pencil if any(isinstance(solver, Dense) for solver in solvers) else on_all_nodes(pencil, k)
 
 

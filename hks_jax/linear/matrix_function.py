@@ -17,8 +17,7 @@ from hks_jax.linear.products import matmul
 
 Matrix = Float[Array, "n n"]
 Function = Callable[[Any, Any, Array], Array]
-"""f(parameters, others, x), elementwise in x. The pytree ``parameters`` has all real arrays; ``others`` has the
-rest."""
+"""f(parameters, others, x), elementwise in x. ``parameters`` has all real arrays; ``others`` has the other arrays."""
 
 
 def matrix_function(A: Any, f: Callable[[Array], Any], B: Any = None) -> Float[Array, "n n"]:

@@ -55,8 +55,7 @@ def coarsen(fine: NodalPencil) -> NodalPencil:
 
 
 def interpolate(fine: NodalPencil, x: Float[Array, "*coarse b"]) -> Float[Array, "*shape b"]:
-    """Interpolate multilinearly from every second node, and constantly beyond the last; 0 at nodes that are not
-    free."""
+    """Interpolate multilinearly from every second node, and constantly beyond the last; 0 except at free nodes."""
     every_second = (slice(None, None, 2),) * len(fine.shape)
     weights = _interpolate(fine.domain[every_second][..., None].astype(x.dtype), fine.shape, fine.periodic)
     x = _interpolate(jnp.where(fine.free[every_second][..., None], x, 0), fine.shape, fine.periodic)

@@ -24,7 +24,7 @@ from hks_jax.linear.loops import for_each
 _GAIN = 40.0
 """The factor by which one round damps unwanted modes. With a larger factor, the error by the lumped mass dominates."""
 _SPREAD = 1e5
-"""The largest growth of the lowest mode relative to the edge of the band. Otherwise, rounding errors dominate."""
+"""The largest growth of the lowest mode relative to the edge of the band. Beyond this limit, rounding dominates."""
 _LEAST_DEGREE = 4
 _MARGIN = 1.1
 """The safety factor of Weyl's law for the eigenvalue of the last vector."""

@@ -126,8 +126,8 @@ class ShiftInvert(Eigensolver[Pencil]):
             values = np.concatenate([values, further])[order]
             vectors = np.concatenate([vectors, others], axis=1)[:, order]
             # Lanczos with single vectors can miss pairs of a multiple eigenvalue. By Sylvester's law of inertia, the
-            # negative pivots of K − σM count the eigenvalues below σ. If pairs are missing, search again, orthogonally
-            # to known pairs.
+            # negative pivots of K − σM count the eigenvalues below σ. If pairs are missing, search orthogonally to
+            # known pairs.
             below = values[-1] - 1e-6 * max(values[-1], shift)
             if below <= 0:  # only null vectors
                 return _padded(values, vectors, k, max(below, 0.0))

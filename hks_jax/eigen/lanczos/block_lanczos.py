@@ -24,8 +24,7 @@ from hks_jax.linear.pencil import SymmetricPencil, tabulated
 from hks_jax.traced import is_traced
 
 SLICE = 170
-"""The number of eigenvalues per slice. Small slices need more factorisations; large slices need more
-orthogonalisation."""
+"""The number of eigenvalues per slice. More slices take more factorisations, but less orthogonalisation."""
 _DENSE = 3000
 """The largest number of unknowns for which the dense solver takes over if slicing fails."""
 

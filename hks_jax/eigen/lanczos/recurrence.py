@@ -61,8 +61,7 @@ def block_lanczos(
     M-orthonormal to rounding.
     """
     state, traced = _begin(pencil, start, known, room), is_traced(shifted)
-    # Under `jit`, the loop takes `room` steps. If the number varied within a batch, each iteration would copy the
-    # state.
+    # Under `jit`, the loop takes `room` steps. If the number varied in a batch, each iteration would copy the state.
     steps = room if traced else int(steps)
     if not traced and shifted.passes is not None and int(shifted.passes) == 1:
         shifted = shifted._replace(passes=None)
