@@ -54,8 +54,8 @@ def atomic_folder(path: str | os.PathLike[str], stale: Callable[[], Iterable[Pat
 
     Args:
         path: the folder.
-        stale: a function that returns the files of an earlier result. They are removed before new files are moved, so
-            that two results are never mixed.
+        stale: a function that returns the files of an earlier result. These files are removed before new files are
+            moved, so that two results are never mixed.
 
     Raises:
         NotADirectoryError: if `path` is a file.

@@ -187,7 +187,7 @@ def tangents_of(
     """Return dλ, dφ and the derivative of the frame for the first k of p computed pairs.
 
     ``prepared`` is the result of `Adjoint.prepare`. ``functions`` are the first k vectors, passed separately because
-    slicing ``vectors`` would copy them.
+    slicing ``vectors`` would copy the slice.
     """
     k = len(functions)
     eigenvalues, guards = values[:k], vectors[k:]
@@ -208,8 +208,8 @@ def tangents_of(
     frame = with_transpose(onto_guards, onto_guards, force)
     if _solves(pencil, k, len(values)):
         # The force is zero for null vectors that every perturbation of K annihilates. In reverse mode, the rows of
-        # these null vectors are cotangents, which may be nonzero; so their solutions are set to zero. JAX needs the
-        # product with the matrix only for second derivatives, so the identity may replace this product.
+        # these null vectors are cotangents, which may be nonzero; so the solutions in these rows are set to zero. JAX
+        # needs the product with the matrix only for second derivatives, so the identity may replace this product.
         free = np.arange(k)[:, None] >= pencil.n_fixed
         rhs = jnp.where(free, -force, 0)
         frame = frame + jnp.where(free, jax.lax.custom_linear_solve(lambda x: x, rhs, solve, symmetric=True), 0)

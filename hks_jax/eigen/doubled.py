@@ -108,7 +108,7 @@ def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: i
 
 
 # Let part B's trial functions include those of part A. Then the j-th eigenvalue of A is not below the j-th eigenvalue
-# of B. If the two are equal, rounding may swap them; then A could have more pairs among the lowest than
+# of B. If the two eigenvalues are equal, rounding may swap them; then A could have more pairs among the lowest than
 # `MirrorPencil.including` allows.
 def _sorted_by(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...]) -> list[Float[Array, " _"]]:
     """Return each part's eigenvalues, the j-th raised to the j-th eigenvalue of every part that includes this part."""

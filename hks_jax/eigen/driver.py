@@ -64,7 +64,7 @@ def eigenpairs(
             callback to the host raises the error. Without ``throw``, ``.result`` has the error's code, derivatives that
             did not converge are NaN, and concrete values cause a warning.
         progress: a function such as ``print`` that receives short texts during a computation with concrete values.
-        interval: (a, b), to compute all eigenpairs with a ≤ λ < b instead of the lowest.
+        interval: the ends (a, b) of an interval; all eigenpairs with a ≤ λ < b are computed instead of the lowest.
         quadrature: see `assemble`. This argument applies only to fields and meshes.
 
     Returns:
@@ -139,10 +139,10 @@ def eigsh(
     Args:
         K: a symmetric (n, n) matrix: a SciPy sparse matrix, a BCOO or BCSR of `jax.experimental.sparse`, an operator of
             this package, or a dense array. Without M, K may also be a pencil from `sparse_pencil` or `assemble`.
-        M: a symmetric positive definite matrix of one of these types, or its diagonal (n,); None is the identity.
+        M: a symmetric positive definite matrix of one of these types, or its diagonal (n,); None means the identity.
         k: the number of pairs, from 1 to n. If an interval is given, see `eigenpairs`.
-        interval: (a, b), to compute all eigenpairs with a ≤ λ < b.
-        solver: see `eigenpairs`; None is ``"auto"``.
+        interval: the ends (a, b) of an interval, in which all eigenpairs with a ≤ λ < b are computed.
+        solver: see `eigenpairs`; None means ``"auto"``.
         throw: see `eigenpairs`.
         progress: see `eigenpairs`.
 

@@ -178,7 +178,7 @@ class Eigenpairs(eqx.Module):
         return code.where(jnp.all(jnp.stack(finite)), result, code.not_finite)
 
     def messages(self) -> list[str]:
-        """Return sentences that describe defects of these pairs. Needs concrete values."""
+        """Return sentences that describe defects of these pairs. Values must be concrete."""
         if not self.k:
             return []
         other = "allow more restarts" if "shift-invert" in self.solver_name else "another solver"
@@ -215,7 +215,7 @@ class Eigenpairs(eqx.Module):
         return sentences
 
     def summary(self) -> str:
-        """Describe size, method, range and quality in a few lines. Needs concrete values."""
+        """Describe size, method, range and quality in a few lines. Values must be concrete."""
         if not self.k:
             return "no eigenpairs: the interval contains no eigenvalue"
         values, residuals = np.asarray(self.eigenvalues), np.asarray(self.residuals)

@@ -1,4 +1,4 @@
-"""The interface of all eigensolvers, and the dense solver, which is the reference for the others."""
+"""The interface of all eigensolvers, and the dense solver, which is the reference for the other solvers."""
 
 from abc import abstractmethod
 from collections.abc import Callable

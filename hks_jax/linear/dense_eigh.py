@@ -50,7 +50,7 @@ def eigh(A: Any, B: Any = None, *, multiplet_tolerance: float | None = None) -> 
 
     Args:
         A: (n, n), symmetric, float32 or float64. Derivatives are with respect to the symmetric part of A.
-        B: (n, n), symmetric positive definite; None: the identity.
+        B: (n, n), symmetric positive definite; None means the identity.
         multiplet_tolerance: eigenvalues count as equal in derivatives if they differ by less than this, relative to the
             largest |λ|. None means 4nε, about the effect of rounding.
 

@@ -42,7 +42,7 @@ def with_transpose(forward: Callable[[Any], Any], backward: Callable[[Any], Any]
     """Return y = ``forward(x)``, linear in x, whose transpose is ``backward``; JAX transposes neither function.
 
     Both x and y are pytrees of floating point arrays. ``at`` contains the other variables of the two functions;
-    derivatives with respect to these have custom rules.
+    derivatives with respect to ``at`` have custom rules.
     """
 
     # JAX transposes a solve only if its whole right-hand side depends on the linearised variables, x or `at`.

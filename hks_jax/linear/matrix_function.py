@@ -35,10 +35,10 @@ def matrix_function(A: Any, f: Callable[[Array], Any], B: Any = None) -> Float[A
 
     Args:
         A: (n, n), symmetric, float32 or float64. Derivatives are with respect to the symmetric part of A.
-        f: a function of JAX operations that maps one eigenvalue, a scalar, to a real scalar. It is also evaluated
+        f: a function of JAX operations that maps one eigenvalue, a scalar, to a real scalar. f is also evaluated
             between eigenvalues. First derivatives use f', second derivatives f''. Between eigenvalues, f need not be
             smooth; so ``lambda x: x < c`` gives the projector on the eigenvectors with λ < c.
-        B: (n, n), symmetric positive definite; None: the identity.
+        B: (n, n), symmetric positive definite; None means the identity.
 
     Returns:
         The symmetric matrix f(A), (n, n). It is NaN if f returns NaN, as for the logarithm of a negative eigenvalue.

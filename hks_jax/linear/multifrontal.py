@@ -66,7 +66,7 @@ class Factorisation(eqx.Module):
 class Trial(NamedTuple):
     """The measured accuracy of a factorisation."""
 
-    sound: Bool[Array, ""]  # whether its inertia equals that of K − σM
+    sound: Bool[Array, ""]  # whether the factors have the inertia of K − σM
     # ‖b − (K − σM)x‖/‖b‖ of solutions x for random b, which estimates the convergence rate of iterative refinement
     rate: Scalar
     # the largest ‖(K − σM)x − b‖/‖Mx‖ of M-orthonormal solutions x. Residuals of eigenpairs near σ cannot be smaller;
@@ -173,7 +173,7 @@ def eliminate(
 
     ``invert`` maps symmetric blocks (fronts, s, s), and the largest absolute value of each front's entries, to
     inverses. The result is (A⁻¹, BA⁻¹) for the fronts of each level. Here A is a front's own block and B its coupling
-    to its boundary, both with the Schur complements of the fronts below added.
+    to its boundary; both include the Schur complements of the fronts below.
     """
     start = list(accumulate((math.prod(level.shape) for level in dissection.levels), initial=0))
     needed = matrix if dissection.entries is None else taken(matrix, dissection.entries)

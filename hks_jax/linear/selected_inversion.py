@@ -29,9 +29,9 @@ def inverse_entries(
 ) -> Inexact[Array, " entries"]:
     """Eliminate a symmetric matrix, real or complex (not Hermitian), and return `selected` entries of its inverse.
 
-    The elimination does not pivot between fronts. This is safe if the real or imaginary part of the matrix is definite,
-    because then no Schur complement is singular. The function is differentiable in both modes; reverse mode stores
-    several copies of the factors.
+    The elimination does not pivot between fronts. Elimination without pivoting is safe if the real or imaginary part of
+    the matrix is definite, because then no Schur complement is singular. The function is differentiable in both modes;
+    reverse mode stores several copies of the factors.
     """
     return selected(dissection, eliminate(dissection, matrix, lambda blocks, _: _inverses(blocks)), diagonal)
 

@@ -39,7 +39,7 @@ Shifts = Float[Array, " groups"]
 SINGULAR = 1e-8
 """The Rayleigh quotient below which K − λᵢM counts as singular, relative to the first eigenvalue on the complement."""
 _LEAST = 100
-"""The least tolerance, and the norm below which a projected row counts as zero, both relative and in units of ε."""
+"""In units of ε: the least relative tolerance, and the relative norm below which a projected row counts as zero."""
 _FACTORISATION = 200
 """The cost of a factorisation in solves of one row. About 100 is doubled, because small rows take few steps."""
 _MOST_GROUPS = 16

@@ -147,9 +147,9 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         return conjugate_gradients(product, precondition, b, wanted, clean=without_known).converged
 
 
-# On the complement, eigenvalues lie on both sides of the computed ones, so that K − λᵢM is indefinite. Let Λ₋ be the
-# last eigenvalue of the complement below the computed ones, and Λ₊ the first above. Let the shift σ, like λᵢ, lie
-# between Λ₋ and Λ₊. Then every λⱼ of the complement is above both σ and λᵢ, or below both. So
+# The eigenvalues of the complement lie on both sides of the computed eigenvalues, so that K − λᵢM is indefinite there.
+# Let Λ₋ be the last eigenvalue of the complement below the computed eigenvalues, and Λ₊ the first above them. Let the
+# shift σ, like λᵢ, lie between Λ₋ and Λ₊. Then every λⱼ of the complement is above both σ and λᵢ, or below both. So
 #
 #     A = (K − σM)⁻¹ (K − λᵢM)
 #
@@ -203,5 +203,5 @@ class InteriorAdjoint(FactorisedAdjoint):
 
 
 def _left(pencil: LocatedPencil, values: Values) -> tuple[Scalar, Scalar]:
-    """Estimate Λ₋ and Λ₊, the eigenvalues of the complement nearest to the computed ones."""
+    """Estimate Λ₋ and Λ₊, the eigenvalues of the complement nearest to the computed eigenvalues."""
     return jnp.min(values) - pencil.spacing, jnp.max(values) + pencil.spacing

@@ -56,7 +56,7 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         block: the number of vectors filtered together. The workspace is proportional to this number.
         max_rounds: the maximal number of rounds on the finest grid.
         mesh: the devices, as a `jax.sharding.Mesh` with one axis. Each device filters some of the vectors, and stores
-            all vectors on a part of the grid (docs/devices.md). None is one device.
+            all vectors on a part of the grid (docs/devices.md). None means one device.
 
     Examples:
         >>> flat = hj.TensorField(hj.Grid((17, 17), 1 / 16), np.tile(np.eye(2), (17, 17, 1, 1)))

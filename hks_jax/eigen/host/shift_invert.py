@@ -38,8 +38,8 @@ class ShiftInvert(Eigensolver[Pencil]):
     Attributes:
         tolerance: the relative residual at which a pair counts as converged; ARPACK itself runs to machine precision.
         max_restarts: the maximal number of implicit restarts.
-        basis: the size of the Lanczos basis; None is 2k + 20. The size is raised if it is not more than the number of
-            pairs, which for derivatives includes guard pairs.
+        basis: the size of the Lanczos basis; None means 2k + 20. The size is raised if it is not more than the number
+            of pairs, which for derivatives includes guard pairs.
 
     Examples:
         >>> sparse = hj.eigenpairs(field, k=12, solver=hj.ShiftInvert(basis=30))

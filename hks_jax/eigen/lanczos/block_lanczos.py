@@ -39,7 +39,7 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
     Attributes:
         tolerance: the relative residual at which a pair counts as converged.
         block: the number of vectors per Lanczos block. Multiplicities may exceed this number.
-        slice_size: the number of eigenvalues per slice; None is automatic.
+        slice_size: the number of eigenvalues per slice; None means an automatic choice.
 
     Examples:
         >>> K = 2 * np.eye(59) - np.eye(59, k=1) - np.eye(59, k=-1)  # a string of 59 beads

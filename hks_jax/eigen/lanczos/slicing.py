@@ -1,4 +1,4 @@
-"""Spectrum slicing: the lowest eigenpairs of a pencil, slice by slice, with a certificate that none is missed.
+"""Spectrum slicing: the lowest eigenpairs of a pencil, slice by slice, with a certificate that no pair is missed.
 
 Each slice factorises K − σM at a shift σ slightly above the known eigenvalues. The inertia gives the number of
 eigenvalues below σ. Block Lanczos finds the eigenvectors below σ that are not known yet, and about as many above σ. The
@@ -38,7 +38,7 @@ _COPY = 1e-6
 Scalar = Float[Array, ""]
 Interval = tuple[Scalar, Scalar]
 Order = Int[Array, " ritz"]
-"""The order in which Ritz vectors are stored; the accepted ones come first."""
+"""The order in which Ritz vectors are stored; accepted vectors come first."""
 
 
 def cut(
