@@ -46,12 +46,12 @@ class StaticArray(ByKey):
 
 
 def jax_array(value: Any) -> Array:
-    """Return a JAX array like `jnp.asarray`, but compile no program for a new shape of NumPy arrays."""
+    """Return a JAX array like `jnp.asarray`, but without compiling a program for each shape of NumPy arrays."""
     return jax.device_put(value) if isinstance(value, np.ndarray) and not is_staged() else jnp.asarray(value)
 
 
 def describe_array(value: Any) -> str:
-    """Return the dtype and shape of an array, such as ``float64 (40, 40, 2, 2)``; otherwise the object's repr."""
+    """Return the dtype and shape of an array, such as ``float64 (40, 40, 2, 2)``; for other objects, the repr."""
     dtype, shape = getattr(value, "dtype", None), getattr(value, "shape", None)
     return repr(value) if dtype is None or shape is None else f"{dtype} {tuple(shape)}"
 

@@ -10,15 +10,15 @@ import platformdirs
 def keep_compiled(folder: str | os.PathLike[str] | None = None) -> Path | None:
     """Let JAX store compiled programs in a folder, from which later processes read them instead of compiling again.
 
-    Call this function once, before any computation. JAX has one such cache per process, so your own programs are stored
-    there as well. Importing the package does not change this setting. A folder that JAX's configuration or the
-    environment already sets as ``jax_compilation_cache_dir`` is kept.
+    Call this function once, before any computation. JAX has one cache of programs per process, so your own programs are
+    stored in the same folder. Importing the package does not turn the cache on. If JAX's configuration or the
+    environment already sets ``jax_compilation_cache_dir``, the cache stays in that folder.
 
     Args:
         folder: the folder, by default ``hks-jax`` in the platform's folder of user caches.
 
     Returns:
-        The folder, or None if it cannot be written, in which case no program is stored.
+        The folder; None if the folder cannot be written, so that no program is stored.
 
     Examples:
         >>> path = hj.keep_compiled(folder / "compiled")
@@ -36,7 +36,7 @@ def keep_compiled(folder: str | os.PathLike[str] | None = None) -> Path | None:
     if not os.access(path, os.W_OK):
         return None
     jax.config.update("jax_compilation_cache_dir", str(path))
-    # By default, JAX stores only programs whose compilation takes at least a second. Reading a program is ten times as
-    # fast as compiling it.
+    # By default, JAX stores only programs whose compilation takes at least a second. Reading is ten times as fast as
+    # compiling.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     return path

@@ -17,9 +17,9 @@ from hks_jax.traced import is_traced
 def require_number(
     name: str, value: Any, below: float = math.inf, *, above: float = 0.0, inclusive: bool = False
 ) -> None:
-    """Raise ValueError unless a setting is a real number between two limits; traced numbers pass.
+    """Raise ValueError unless a setting is a real number between two limits; traced numbers are not checked.
 
-    The upper limit is excluded. The lower limit ``above`` is excluded unless ``inclusive`` is set.
+    The upper limit ``below`` is excluded. The lower limit ``above`` is excluded unless ``inclusive`` is set.
     """
     if is_traced(value):
         return

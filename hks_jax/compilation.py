@@ -19,15 +19,15 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 _OPTIONS: dict[str, bool | int | str] = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 2}
-"""Compiler options that halve the time of compilation. In measurements, the compiled code was as fast as by default."""
+"""Compiler options that halve the time of compilation. In measurements, the compiled code was equally fast."""
 
 NumPyRule = Callable[[list[Any], list[Any] | None, list[Any] | None], Any]
-"""A function of (primals, x, y) that evaluates a function or its derivative by NumPy; None means that it cannot.
+"""A function of (primals, x, y) that computes a function or its derivative by NumPy, or returns None if it cannot.
 
 The primals are all arguments, x are tangents of some arguments, and y are cotangents of the leaves of the result. If x
-and y are None, the rule returns the result. If only y is None, the rule returns the tangent of the result. Otherwise,
-the rule returns the cotangents of x, and x contains only shapes. For a linear function, None replaces the linear
-arguments in the primals.
+and y are None, the rule returns the result. If only y is None, the rule returns the tangent of the result. Otherwise, x
+contains only shapes, and the rule returns the cotangents of these arguments. For a linear function, None replaces the
+linear arguments in the primals.
 """
 
 
@@ -41,13 +41,13 @@ def jit_quickly(
     """Return a decorator like `jax.jit`, or `equinox.filter_jit`, that compiles faster on CPUs.
 
     Compiler options apply only to calls outside `jax.jit`, because XLA compiles an enclosing function as a whole. If
-    the environment variable XLA_FLAGS sets one of these options, the function is compiled without them.
+    the environment variable XLA_FLAGS sets one of these options, the decorator sets none of them.
 
     Args:
         jit: the decorator that compiles.
         linear: the names of the arguments in which the function is jointly linear.
-        shapes: maps all arguments to a pytree with the shapes of the result, for linear functions.
-        numpy_rule: evaluates the function and its derivatives by NumPy for concrete arguments on a CPU.
+        shapes: for a linear function, the function that maps all arguments to a pytree with the shapes of the result.
+        numpy_rule: the rule that computes the function and its derivatives by NumPy for concrete arguments on a CPU.
         settings: the keyword arguments of ``jit``.
     """
 
@@ -124,7 +124,7 @@ def by_numpy(function: Callable[..., Any], *args: Any) -> Any:
 
     known = jax.tree.map(on_host, args, is_leaf=lambda x: hasattr(x, "to_scipy"))
     with np.errstate(all="ignore"):
-        # `device_put`, because `jnp.asarray` returns NumPy arrays during differentiation.
+        # During differentiation, `jnp.asarray` would return NumPy arrays.
         return jax.device_put(jax.tree.map(np.asarray, function(*known)))
 
 
@@ -148,7 +148,7 @@ def _understood() -> bool:
 
 
 class _Program(NamedTuple):
-    """A function of a flat list of arrays, with its static arguments. Equal instances share one compilation."""
+    """A function of a flat list of arrays and of static arguments. Equal instances share one compilation."""
 
     function: Callable[..., Any]
     fixed: tuple[Any, ...]
@@ -162,7 +162,7 @@ class _Program(NamedTuple):
         return [known if x is None else eqx.combine(known, x) for known, x in zip(*self.split(*leaves), strict=True)]
 
     def split(self, *leaves: Any) -> tuple[list[Any], list[Any]]:
-        """Return the constant arguments and the differentiated ones; None replaces leaves of the other list."""
+        """Return the constant and the differentiated arguments; each list has None for the other list's leaves."""
         known, x = jax.tree.unflatten(self.structure, leaves)
         return [own if fixed is None else fixed for own, fixed in zip(known, self.fixed, strict=True)], x
 
@@ -176,8 +176,8 @@ class _LinearMap(NamedTuple):
 
     Attributes:
         program: the function, which must be linear in its last arguments if `tangent` is false.
-        tangent: whether the map is the derivative of the program by its last arguments; their values are then the last
-            constants.
+        tangent: whether the map is the derivative of the program with respect to its last arguments; then the values of
+            these arguments are the last constants.
         x: the shapes of the inputs of the map without transposition.
         y: the shapes of the results of the map without transposition.
         transposed: whether to apply the transpose.

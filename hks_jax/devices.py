@@ -52,8 +52,7 @@ def map_fields(function: Callable[[Any], Any], batch: Any, mesh: Mesh) -> Any:
 @partial(jax.jit, static_argnames=("function", "mesh"))
 def _map(function: Callable[[Any], Any], batch: Any, mesh: Mesh) -> Any:
     n, spec = jax.tree.leaves(batch)[0].shape[0], PartitionSpec(mesh.axis_names[0])
-    # The batch is padded with copies of its last entry, because for zeros the function might return NaN or not
-    # terminate.
+    # Padding copies the last entry, because for zeros the function might return NaN or not terminate.
     filled = jax.tree.map(lambda x: x[jnp.minimum(jnp.arange(-(-n // mesh.size) * mesh.size), n - 1)], batch)
     share = jax.shard_map(
         lambda own: jax.lax.map(function, own), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
@@ -70,26 +69,27 @@ def heat_columns(
     tolerance: float = 1e-8,
     degree: int | None = None,
 ) -> Float[Array, "n_times *padded b"]:
-    """Return exp(−tD⁻¹K) x for each time t and column x. Columns x = D⁻¹eᵢ give columns of the heat kernel.
+    """Return exp(−tD⁻¹K) x for each time t and column x, where K is the stiffness and D is the lumped mass.
 
-    Use this function for fields that exceed the memory of one device. Each degree of the Chebyshev expansion takes one
-    product with K; for this product, neighbouring devices exchange one plane of nodes. All times use the same products.
+    If x is D⁻¹ times a unit vector, the result is a column of the heat kernel. Use this function for fields that exceed
+    the memory of one device. Each degree of the Chebyshev expansion takes one product with K; for this product,
+    neighbouring devices exchange one plane of nodes. All times use the same products.
 
     Args:
         slabs: the partition of the grid.
         stiffness: the stiffness matrix K, ``slabs.split(pencil.stiffness.coefficients, 1)``.
         lumped: the row sums D of the mass matrix, ``slabs.split(...)``; 0 at nodes that are not free.
-        columns: nodal values x; the last axis is the index of the column. ``slabs.split(...)`` makes them.
-        times: (n_times,), nonnegative.
+        columns: nodal values x; the last axis is the index of the column. ``slabs.split(...)`` makes this array.
+        times: (n_times,) nonnegative times.
         tolerance: a bound on the truncation error of the expansion, relative to the columns, in the norm of D.
-        degree: the degree of the polynomial, by default the least that satisfies the tolerance. Required for traced
-            arrays.
+        degree: the polynomial's degree, by default the least that satisfies the tolerance; required if arrays are
+            traced.
 
     Returns:
         Values in the layout of the columns. ``slabs.join(result, 1)`` removes the padding.
 
     Raises:
-        ValueError: if arrays are not from `Slabs.split`, if times or tolerance are invalid, or if traced arrays lack a
+        ValueError: arrays are not from `Slabs.split`, times or tolerance are invalid, or arrays are traced without a
             degree.
 
     Examples:
@@ -131,8 +131,8 @@ def chebyshev_series(
 ) -> Float[Array, "m *padded b"]:
     """Return Σₙ cₘₙ Tₙ(2D⁻¹K/top − 1) x for each column x, where c is the series and Tₙ are Chebyshev polynomials.
 
-    The number ``top`` is an upper bound of the spectrum of D⁻¹K. The series has at least two terms. The arrays have the
-    layout of `heat_columns`. The result is linear in the series and in the columns, and differentiable.
+    The number ``top`` is an upper bound of the spectrum of D⁻¹K. The series has at least two terms. K, D and the layout
+    of the arrays are as in `heat_columns`. The result is linear in the series and in the columns, and differentiable.
 
     Examples:
         >>> slabs = hj.devices.Slabs(jax.make_mesh((1,), ("devices",)), (9, 9), (False, False))
@@ -159,5 +159,5 @@ def chebyshev_series(
 
 
 def _inverse(lumped: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Return D⁻¹ with 0 at nodes that are not free."""
+    """Return the inverse of the lumped mass, with 0 at nodes that are not free."""
     return jnp.where(lumped > 0, 1 / jnp.where(lumped > 0, lumped, 1), 0)

@@ -54,8 +54,8 @@ def atomic_folder(path: str | os.PathLike[str], stale: Callable[[], Iterable[Pat
 
     Args:
         path: the folder.
-        stale: a function that returns the files of an earlier result. They are removed before new files are moved, so
-            that two results are never mixed.
+        stale: a function that returns the files of an earlier result. These files are removed before new files are
+            moved, so that two results are never mixed.
 
     Raises:
         NotADirectoryError: if `path` is a file.
@@ -92,11 +92,11 @@ def atomic_folder(path: str | os.PathLike[str], stale: Callable[[], Iterable[Pat
 
 @contextmanager
 def claim(path: str | os.PathLike[str]) -> Iterator[bool]:
-    """Lock the file at `path`, and yield whether this process thus has exclusive access to a piece of work.
+    """Lock the file at `path`; yield True if the lock gives this process exclusive access to a piece of work.
 
-    At the end the file is removed, and its folder as well if it is empty. If the process dies, the operating system
-    releases the lock and the file remains, which shows that the work was begun. Windows and some network drives have no
-    such locks; there, every process gets access.
+    At the end, the file is removed; its folder is removed too if no other files are in it. If the process dies, the
+    operating system releases the lock and the file remains, which shows that the work was begun. Windows and some
+    network drives have no such locks; there, every process gets access.
     """
     file = Path(path)
     held = _hold(file)
@@ -108,7 +108,7 @@ def claim(path: str | os.PathLike[str]) -> Iterator[bool]:
             yield True
         finally:
             file.unlink(missing_ok=True)
-            with suppress(OSError):  # the folder has other files
+            with suppress(OSError):  # if the folder has other files
                 file.parent.rmdir()
 
 
@@ -196,7 +196,7 @@ def _check_number(file: Path, archive: zipfile.ZipFile) -> None:
 
 
 def load_npy(path: str | os.PathLike[str]) -> np.ndarray:
-    """Return the array of an npy file, with errors as in `load_npz`.
+    """Return the array of an npy file; raise errors as `load_npz` does.
 
     The format has no checksum; only the file's length is compared with the declared length.
     """
@@ -206,7 +206,7 @@ def load_npy(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def _array(stream: io.BytesIO | io.BufferedReader, length: int) -> np.ndarray:
-    """Return the array in a stream, after its declared size was compared with the stream's length."""
+    """Return the array in a stream; raise ValueError if its declared size does not match the stream's length."""
     version = npy.read_magic(stream)
     if version not in _HEADERS:
         raise ValueError(f"got format version {version}; expected one of {', '.join(map(str, _HEADERS))}")

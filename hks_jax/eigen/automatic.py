@@ -19,23 +19,23 @@ SOLVERS: dict[str, Callable[[], Eigensolver]] = {
 }
 
 _SMALL = 1500
-"""The largest number of unknowns n for which the dense solver is chosen; it takes O(n³) time."""
+"""The largest number n of unknowns for which the dense solver, which takes O(n³) time, is chosen."""
 
-# Shift-invert competes with a solver in JAX, "ours": the Chebyshev filter on grids in 3D or in float32, otherwise block
-# Lanczos. A solver in JAX takes about five seconds to compile at any size. So up to n·k = 5 million, no solver is the
-# fastest in the first call and in later calls. In each of these two cases, a solver is slower than the fastest one by
-# some factor; the choice minimises the larger factor (benchmarks/first_answer/automatic.py), except for small volumes
-# in float32. Block Lanczos in float32 also factorises in float32; so it searches repeatedly, and some pairs do not
-# converge.
+# The choice is between shift-invert and a solver in JAX, called ``ours``: the Chebyshev filter on grids in 3D or in
+# float32, otherwise block Lanczos. A solver in JAX takes about five seconds to compile at any size. So up to n·k = 5
+# million, the fastest solver of the first call is not the fastest of later calls. Each solver has two ratios of its
+# time to the shortest time: one for the first call and one for later calls. The choice minimises the larger ratio
+# (benchmarks/first_answer/automatic.py), except for small volumes in float32. In float32, block Lanczos also factorises
+# in float32; so it searches repeatedly, and leaves some pairs unconverged.
 _LARGE, _LARGE_IN_SINGLE = 800_000, 5_000_000
-"""The least n·k for which a solver in JAX is chosen. The second value is for 2D grids in single precision."""
+"""The least n·k (unknowns times pairs) for which a solver in JAX is chosen. The second is for 2D grids in float32."""
 
 
 def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensolver:
     """Return the solver with the given name.
 
-    ``"auto"`` chooses by the pencil's size, k and dtype. Shift-invert runs on the host. So ``"auto"`` never chooses it
-    on an accelerator, or for traced values (`jax.jit`, `jax.vmap`).
+    ``"auto"`` chooses by the pencil's size, k and dtype. On an accelerator or for traced values (`jax.jit`,
+    `jax.vmap`), it never chooses shift-invert, because shift-invert runs on the host.
 
     Raises:
         ValueError: the name is unknown.

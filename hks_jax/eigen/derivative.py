@@ -26,10 +26,10 @@ from hks_jax.linear.products import inner_products, matmul
 from hks_jax.traced import is_traced
 
 OnFailure = Literal["nothing", "warning", "error"]
-"""The action if the linear solves of a derivative do not converge, in addition to the result NaN."""
+"""The action if the linear solves of a derivative do not converge; the derivative is NaN in any case."""
 
 _ON_HOST = 1 << 22
-"""The largest number of eigenvectors' entries for which NumPy differentiates as fast as JAX, without compilation."""
+"""The largest total size of eigenvectors at which NumPy computes derivatives as fast as compiled JAX code does."""
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 2, 3, 4, 5, 6))
@@ -39,10 +39,10 @@ def solved(
     """Return k eigenvalues, their eigenvectors, the frame (the same vectors), the next eigenvalue, and a bound.
 
     The pairs are the lowest or, if ``interior``, the first above the origin of a `LocatedPencil`. The derivative of the
-    frame is that of the eigenvectors, but excludes rotations of the k eigenvectors among themselves. The next
-    eigenvalue is infinite unless ``extra`` = 1; the bound is the solver's certificate. Derivatives treat these two as
-    constants. A derivative whose linear solves do not converge is NaN. This also raises an error if ``throw`` is set,
-    and otherwise warns if values are concrete.
+    frame excludes rotations of the k eigenvectors among themselves, and otherwise equals that of the eigenvectors. The
+    next eigenvalue is infinite unless ``extra`` = 1; the bound is the solver's certificate. Derivatives treat the next
+    eigenvalue and the bound as constants. A derivative whose linear solves do not converge is NaN. Such a failure
+    raises an error if ``throw`` is set, and otherwise a warning if values are concrete.
     """
     values, vectors, complete_below = _computed(solver, pencil, k, extra, interior, report)
     values, vectors, following = _cut(values, vectors, k)
@@ -53,22 +53,22 @@ def solved(
 #
 #     dλᵢ = φᵢᵀfᵢ,    dφᵢ = −½ (φᵢᵀ dM φᵢ) φᵢ + Σ_{j≠i} φⱼ (φⱼᵀfᵢ)/(λᵢ − λⱼ).
 #
-# The sum is over all j. Its terms for computed pairs are evaluated directly. The sum xᵢ of the other terms solves
+# The sum is over all j. The terms for computed pairs are evaluated directly. The sum xᵢ of the other terms solves
 #
 #     (K − λᵢM) xᵢ = −Q fᵢ,   Φᵀ M xᵢ = 0,   Q = I − MΦΦᵀ,
 #
-# on the M-orthogonal complement of the computed Φ, where K − λᵢM is positive definite. Reverse mode uses the symmetry
-# of the map fᵢ ↦ xᵢ. The solver computes some guard pairs beyond k, so that λᵢ is not close to the eigenvalues on the
-# complement. In the interior of a spectrum, the complement has eigenvalues on both sides of λᵢ. So there are guards on
-# both sides: at most half of the guards lie below the origin, and the others follow the k pairs.
+# on the M-orthogonal complement of the computed eigenvectors Φ. On this complement, K − λᵢM is positive definite.
+# Reverse mode uses the symmetry of the map fᵢ ↦ xᵢ. The solver computes some guard pairs beyond k, so that λᵢ is not
+# close to the eigenvalues on the complement. In the interior of a spectrum, the complement has eigenvalues on both
+# sides of λᵢ. So guards lie on both sides: at most half of them below the origin, and the others after the k pairs.
 #
-# Within a multiple eigenvalue, the coefficient of φⱼ in dφᵢ (j ≠ i, λᵢ = λⱼ) is a gauge, because every basis of the
-# eigenspace is valid. The rule sets it to −½ φⱼᵀ dM φᵢ, which keeps Φ M-orthonormal and is never NaN. If a gap is below
-# √ε (λ − λ₀), where λ₀ is the lowest computed eigenvalue, the rule does the same, because division by such a gap would
-# lose all digits. So dφᵢ is a derivative only if λᵢ is simple; of the dλᵢ of equal eigenvalues, only the sum has a
-# meaning. Quantities that are independent of the basis, such as spectral functions, must not use this gauge. They use
-# the frame instead: its derivative contains only the sum over j > k, which is the same for every basis of the first k
-# eigenvectors (hks_jax/signatures/spectral_functions.py). `of_simple` hides the gauge from users.
+# If λᵢ = λⱼ and j ≠ i, the coefficient of φⱼ in dφᵢ is arbitrary (a gauge), because every basis of the eigenspace is
+# valid. The rule sets this coefficient to −½ φⱼᵀ dM φᵢ, which keeps Φ M-orthonormal and is never NaN. The rule does the
+# same if |λᵢ − λⱼ| is below √ε (λ − λ₀), where λ is the larger of the two eigenvalues and λ₀ the lowest of all; a
+# division by such a gap would lose all digits. So dφᵢ is a derivative only if λᵢ is simple. For equal eigenvalues, only
+# the sum of their dλᵢ has a meaning. Spectral functions do not depend on the basis, so their derivatives must not
+# contain the gauge. They use the frame, whose derivative contains only the sum over j > k, which is the same for every
+# basis of the first k eigenvectors (hks_jax/signatures/spectral_functions.py). `of_simple` hides the gauge from users.
 @solved.defjvp
 def _solved_jvp(
     solver: Eigensolver, k: int, extra: int, interior: bool, throw: bool, report: Report, primals: Any, changes: Any
@@ -78,7 +78,7 @@ def _solved_jvp(
     spare = max(extra, min(sides * solver.guards(k, n_dof), solver.max_pairs(n_dof) - k))
     values, vectors, complete_below = _computed(solver, pencil, k, spare, interior, report)
     adjoint = InteriorAdjoint(solver.adjoint.tolerance) if interior else solver.adjoint
-    # The preparation does not depend on the change, so that all products with one Jacobian share it.
+    # The prepared data do not depend on the change, so all products with one Jacobian share them.
     prepared = one_by_one(_prepare, (adjoint, k), pencil, values) if _solves(pencil, k, len(values)) else None
     if isinstance(pencil, Pencil) and pencil.metric is not None:
         # Reverse mode stores all arrays of the arguments; derivatives do not need the metric.
@@ -109,7 +109,7 @@ def _cut(xp: Any, values: Any, vectors: Any, k: int) -> tuple[Any, Any, Any]:
 
 
 def _solves(pencil: SymmetricPencil, k: int, p: int) -> bool:
-    """Return whether derivatives of the first k of p computed pairs have components along eigenvectors not computed."""
+    """Return whether derivatives of the first k of p computed pairs have components along other eigenvectors."""
     return p < pencil.size and pencil.n_fixed < k
 
 
@@ -119,7 +119,7 @@ def _shapes(*args: Any) -> tuple[Any, Any, Any]:
 
 
 def _numpy_rule(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
-    """Compute `tangents_of` by NumPy or, given cotangents y of its result, the cotangents of the change."""
+    """Compute `tangents_of` by NumPy. Given cotangents y of its result, compute cotangents of the change instead."""
     adjoint, on_failure, prepared, pencil, _, *pairs = known
     values, vectors, functions = map(np.asarray, pairs)
     if vectors.size > _ON_HOST or x is None:
@@ -157,14 +157,14 @@ def _numpy_rule(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> A
 
 
 def change_of(change: SymmetricPencil, x: Rows, *p: Rows) -> SymmetricPencil:
-    """Return the cotangent of a pencil: Σᵢ pᵢxᵢᵀ for the stiffness and for the mass, with one array p for each."""
+    """Return a pencil's cotangent Σᵢ pᵢxᵢᵀ, where the first p is for the stiffness and the second is for the mass."""
     zeros = jax.tree.map(lambda like: jax.device_put(np.zeros(like.shape, like.dtype)), change)
     matrices = tuple(matrix.outer(each, x) for matrix, each in zip((zeros.stiffness, zeros.mass), p, strict=True))
     return eqx.tree_at(lambda pencil: (pencil.stiffness, pencil.mass), zeros, matrices)
 
 
 def _gaps(xp: Any, values: Any, k: int, rounding: Any) -> tuple[Any, Any]:
-    """Return the mask (k, p) of eigenvalues λᵢ and λⱼ that count as distinct, and 1/(λᵢ − λⱼ), or 0 if they do not."""
+    """Return the mask (k, p) of pairs of distinct eigenvalues, and 1/(λᵢ − λⱼ), which is 0 for equal eigenvalues."""
     gap, above = values[:k, None] - values[None], values - xp.nanmin(values)
     least = xp.sqrt(xp.finfo(values.dtype).eps) * xp.maximum(above[:k, None], above[None])
     apart = xp.abs(gap) > xp.maximum(least, rounding)
@@ -186,8 +186,8 @@ def tangents_of(
 ) -> tuple[OfRows, Rows, Rows]:
     """Return dλ, dφ and the derivative of the frame for the first k of p computed pairs.
 
-    ``prepared`` is the result of `Adjoint.prepare`. ``functions`` are the first k vectors; a slice of ``vectors`` would
-    be a copy.
+    ``prepared`` is the result of `Adjoint.prepare`. ``functions`` are the first k vectors, passed separately because
+    slicing ``vectors`` would copy the slice.
     """
     k = len(functions)
     eigenvalues, guards = values[:k], vectors[k:]
@@ -207,16 +207,16 @@ def tangents_of(
 
     frame = with_transpose(onto_guards, onto_guards, force)
     if _solves(pencil, k, len(values)):
-        # The force is zero for null vectors that every perturbation annihilates. In reverse mode, the rows of these
-        # null vectors are cotangents, so their solutions are set to zero. JAX uses the product with the matrix only for
-        # second derivatives; here the identity replaces this product.
+        # The force is zero for null vectors that every perturbation of K annihilates. In reverse mode, the rows of
+        # these null vectors are cotangents, which may be nonzero; so the solutions in these rows are set to zero. JAX
+        # needs the product with the matrix only for second derivatives, so the identity may replace this product.
         free = np.arange(k)[:, None] >= pencil.n_fixed
         rhs = jnp.where(free, -force, 0)
         frame = frame + jnp.where(free, jax.lax.custom_linear_solve(lambda x: x, rhs, solve, symmetric=True), 0)
     return jnp.diagonal(into), matmul(within, functions) + frame, frame
 
 
-# `one_by_one` needs the same function object in every call; so the next two are module functions, not methods.
+# `one_by_one` needs the same function object in every call; so the next two functions are at module level.
 def _lowest(solver: Eigensolver, k: int, report: Report, pencil: SymmetricPencil) -> RawPairs:
     return solver.lowest(pencil, k, report)
 
@@ -226,7 +226,7 @@ def _prepare(adjoint: Adjoint, k: int, pencil: SymmetricPencil, values: Values) 
 
 
 def _checked(on_failure: OnFailure, x: Rows) -> Rows:
-    """Return the solutions x; if rows of x are NaN, also warn or raise as ``on_failure`` says."""
+    """Return the solutions x; if rows of x are NaN, also warn or raise an error as ``on_failure`` states."""
     failed = jnp.sum(jnp.any(jnp.isnan(x), axis=1))
     if on_failure == "error":
         return eqx.error_if(x, failed > 0, unsolved("some", len(x)))
@@ -245,7 +245,7 @@ def _checked(on_failure: OnFailure, x: Rows) -> Rows:
 def _with_null_modes(xp: Any, mass: Any, nulls: Any, values: Any, vectors: Any) -> tuple[Any, Any]:
     """Replace the solver's approximations of null vectors by the pencil's null vectors.
 
-    Their eigenvalue becomes exactly 0 instead of about ±1e-13. Other vectors become orthogonal to the null vectors.
+    The eigenvalues of null vectors become 0 instead of about ±1e-13. Other vectors become orthogonal to null vectors.
     """
     product: Any
     inverse_cholesky: Any
@@ -271,8 +271,8 @@ def _with_null_modes(xp: Any, mass: Any, nulls: Any, values: Any, vectors: Any) 
 def frame_of_chosen(vectors: Rows, mass: Operator, chosen: Bool[Array, " k"]) -> Rows:
     """Return the vectors, with a derivative that excludes rotations of the chosen vectors among themselves.
 
-    The result is a frame of the chosen vectors. A frame of all vectors would also exclude rotations towards vectors
-    that are not chosen.
+    The result is a frame of the chosen vectors. A frame of all vectors would also exclude rotations towards other
+    vectors.
     """
     return vectors
 

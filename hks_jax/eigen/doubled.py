@@ -23,9 +23,9 @@ def solve_doubled(
 ) -> Eigenpairs:
     """Solve all parts and return the k lowest pairs of the merged spectrum; ``extra`` = 1 adds the next eigenvalue.
 
-    The number of pairs from each part is not known beforehand. For traced values, it is the upper bound from `_limits`.
-    For concrete values, it begins with an equal share plus a margin, and is doubled while the part may lack a pair. By
-    Weyl's law, the parts' boundary conditions change their shares by about the square root of the total.
+    For traced values, each part computes the largest number of pairs that it may contribute (`_limits`). For concrete
+    values, each part begins with an equal share plus a margin, and doubles this number while a pair may be missing. By
+    Weyl's law, boundary conditions change a part's share by about the square root of the total.
     """
     parts, total = pencil.parts, k + extra
     whole, limits = widened(pencil, solvers, total), _limits(pencil, total)
@@ -108,10 +108,10 @@ def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: i
 
 
 # Let part B's trial functions include those of part A. Then the j-th eigenvalue of A is not below the j-th eigenvalue
-# of B. If the two are equal, rounding may swap them; then A could have more pairs among the lowest than
+# of B. If the two eigenvalues are equal, rounding may swap them; then A could have more pairs among the lowest than
 # `MirrorPencil.including` allows.
 def _sorted_by(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...]) -> list[Float[Array, " _"]]:
-    """Return each part's eigenvalues; the j-th is raised to the j-th of every part that includes this part."""
+    """Return each part's eigenvalues, the j-th raised to the j-th eigenvalue of every part that includes this part."""
     keys: list[Array] = []
     for pairs, including in zip(solved, pencil.including, strict=True):
         own = pairs.eigenvalues

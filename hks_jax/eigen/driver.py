@@ -47,24 +47,25 @@ def eigenpairs(
             (K, M). `sparse_pencil` describes the accepted matrices.
         k: the number of pairs, from 1 to the number of degrees of freedom. With an interval, leave k out; but if values
             are traced, k must be the number of eigenvalues in the interval (`count_eigenvalues`).
-        boundary: see `assemble`. Only for fields and meshes.
-        solver: ``"auto"`` (chosen by size, but never a solver on the host under `jit`, `vmap` or on accelerators),
+        boundary: see `assemble`. This argument applies only to fields and meshes.
+        solver: ``"auto"`` (a choice by size, but never a solver on the host under `jit`, `vmap` or on accelerators),
             ``"dense"``, ``"shift-invert"`` (on the host), ``"block-lanczos"`` (mainly for 2D and surfaces),
             ``"chebyshev-filter"`` (for grids, mainly in 3D), or a solver object such as
             ``hks_jax.BlockLanczos(tolerance=1e-6)``. The result names the solver in ``.solver_name``. An interval, or a
-            stiffness that may be indefinite, needs ``"dense"`` or ``"block-lanczos"``; for such a stiffness with
-            concrete values, ``"shift-invert"`` works too. Derivatives in an interval use only the tolerance of the
+            stiffness that may be indefinite, needs ``"dense"`` or ``"block-lanczos"``. For an indefinite stiffness with
+            concrete values, ``"shift-invert"`` works too. For an interval, derivatives use only the tolerance of the
             solver's ``adjoint``.
-        mass: ``"consistent"`` or ``"lumped"``. Only for fields and meshes.
-        multiplet: the treatment of a multiple eigenvalue that k cuts; unused in an interval. ``"report"`` warns.
-            ``"drop"`` excludes its pairs from every signature. ``"complete"`` computes 8 additional pairs and includes
-            the missing ones, or drops the eigenvalue if 8 are too few. ``.kept`` marks the included pairs.
+        mass: ``"consistent"`` or ``"lumped"``. This argument applies only to fields and meshes.
+        multiplet: the treatment of a multiple eigenvalue of which only some pairs are among the k lowest; unused with
+            an interval. ``"report"`` warns. ``"drop"`` excludes these pairs from every signature. ``"complete"``
+            computes 8 more pairs and includes the missing pairs, or drops the eigenvalue if 8 pairs are too few.
+            ``.kept`` marks the included pairs.
         throw: whether to raise an error if ``.result`` is not successful or derivatives do not converge; under `jit`, a
-            callback to the host raises it. Otherwise ``.result`` has the error's code, and derivatives that did not
-            converge are NaN; concrete values also cause a warning.
+            callback to the host raises the error. Without ``throw``, ``.result`` has the error's code, derivatives that
+            did not converge are NaN, and concrete values cause a warning.
         progress: a function such as ``print`` that receives short texts during a computation with concrete values.
-        interval: (a, b), to compute all eigenpairs with a ≤ λ < b instead of the lowest.
-        quadrature: see `assemble`. Only for fields and meshes.
+        interval: the ends (a, b) of an interval; all eigenpairs with a ≤ λ < b are computed instead of the lowest.
+        quadrature: see `assemble`. This argument applies only to fields and meshes.
 
     Returns:
         The pairs with residuals and convergence flags. The eigenvalue of a null vector is exactly zero. (Each component
@@ -77,8 +78,8 @@ def eigenpairs(
         RuntimeError: the computation failed and ``throw`` is set.
 
     Warns:
-        AccuracyWarning: values are concrete, and pairs did not converge, the solver could not confirm that it missed no
-            eigenvalue, or k cuts a multiple eigenvalue.
+        AccuracyWarning: values are concrete, and some pairs did not converge, the solver could not confirm that it
+            missed no eigenvalue, or k cuts a multiple eigenvalue.
 
     Examples:
         >>> flat = hj.TensorField(field.grid, np.tile(np.eye(2), (9, 9, 1, 1)))
@@ -121,7 +122,7 @@ def eigsh(
     throw: bool = False,
     progress: Report | None = None,
 ) -> Eigenpairs:
-    """Compute the lowest eigenpairs of a sparse symmetric pencil, or all in an interval, and certify completeness.
+    """Compute the lowest eigenpairs of a sparse symmetric pencil, or all in an interval; certify that none is missing.
 
     ``eigsh(K, M, k)`` equals ``eigenpairs(sparse_pencil(K, M), k)``. The function corresponds to
     `scipy.sparse.linalg.eigsh` with ``which="LM"`` and ``sigma`` below the spectrum, but needs no shift. K may be
@@ -137,11 +138,11 @@ def eigsh(
 
     Args:
         K: a symmetric (n, n) matrix: a SciPy sparse matrix, a BCOO or BCSR of `jax.experimental.sparse`, an operator of
-            this package, or a dense array. K may also be a pencil from `sparse_pencil` or `assemble`, without M.
-        M: a symmetric positive definite matrix of such a type, or its diagonal (n,); None is the identity.
-        k: the number of pairs, from 1 to n. See `eigenpairs` for k with an interval.
-        interval: (a, b), to compute all eigenpairs with a ≤ λ < b.
-        solver: see `eigenpairs`; None is ``"auto"``.
+            this package, or a dense array. Without M, K may also be a pencil from `sparse_pencil` or `assemble`.
+        M: a symmetric positive definite matrix of one of these types, or its diagonal (n,); None means the identity.
+        k: the number of pairs, from 1 to n. If an interval is given, see `eigenpairs`.
+        interval: the ends (a, b) of an interval, in which all eigenpairs with a ≤ λ < b are computed.
+        solver: see `eigenpairs`; None means ``"auto"``.
         throw: see `eigenpairs`.
         progress: see `eigenpairs`.
 

@@ -16,7 +16,7 @@ from hks_jax.fem.space import FunctionSpace
 from hks_jax.traced import is_traced
 
 _ROUNDED = 1e-3
-"""The least relative error of eigenvalues, from rounding tensors to float32, that a message reports."""
+"""If rounding tensors to float32 changes eigenvalues by more than this relative error, a message reports it."""
 _SAMPLE = 20_000
 """The number of tensors in the sample that measures anisotropy."""
 
@@ -37,33 +37,31 @@ class RESULTS(eqx.Enumeration):
 
 
 class Eigenpairs(eqx.Module):
-    """The k lowest eigenpairs of Kφ = λMφ, or those in an interval; a pytree.
+    """The k lowest eigenpairs of Kφ = λMφ, or all eigenpairs in an interval; a pytree.
 
     The derivatives of signatures with respect to the matrices use `pencil` and `frame`, not `eigenvalues` and
-    `vectors`. So do not rescale these arrays: derivatives of signatures would then refer to the new arrays, not to the
-    matrices. Rescale times or the pencil instead.
+    `vectors`. So do not rescale `eigenvalues` or `vectors`: derivatives of signatures would then refer to the new
+    arrays, not to the matrices. Rescale times or the pencil instead.
 
     Attributes:
         eigenvalues: (k,) in ascending order, in 1/(metric length)²; exactly 0 for null vectors.
-        vectors: (k, n_dof) coefficients of the eigenfunctions, with φᵢᵀMφⱼ = δᵢⱼ. Under "mirror" and "mean", this holds
-            on the doubled domain; so each doubling divides the norm on the domain itself by √2.
-        frame: (k, n_dof) the same values as `vectors` with another derivative, which excludes rotations of the
-            eigenfunctions among themselves. These rotations are singular at multiple eigenvalues and irrelevant to
-            signatures.
+        vectors: (k, n_dof) coefficients of the eigenfunctions, with φᵢᵀMφⱼ = δᵢⱼ. For the boundaries "mirror" and
+            "mean", M is that of the doubled domain; so each doubling divides the norm on the domain itself by √2.
+        frame: (k, n_dof) the values of `vectors`, but with a derivative that excludes rotations of eigenfunctions among
+            themselves. Such rotations are singular at multiple eigenvalues, and do not affect signatures.
         residuals: (k,) ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁), where λ₁ is the first positive eigenvalue. In an interval, or if
-            the null space is unknown, max(λ, λ₁) is replaced by the distance of λ from `spectral_origin`, but at least
-            by the mean gap of the eigenvalues.
-        converged: (k,) whether the residual is at most the solver's tolerance, or the level of rounding if larger.
+            the null space is unknown, max(λ, λ₁) is replaced by the larger of two numbers: the mean gap of the
+            eigenvalues, and the distance of λ from `spectral_origin`.
+        converged: (k,) whether the residual is at most the solver's tolerance, or at most the level of rounding.
         kept: (k,) whether each pair belongs to the truncated spectrum; signatures ignore the other pairs.
-            ``multiplet="drop"`` and ``"complete"`` may exclude the last pairs, and `of_part` the pairs of the other
-            parts.
-        part: (k,) under "mirror" and "mean" the index of the pencil's part that each pair belongs to (0 is the Neumann
-            problem); otherwise None.
+            ``multiplet="drop"`` and ``"complete"`` may exclude the last pairs; `of_part` excludes other parts.
+        part: (k,) for the boundaries "mirror" and "mean", the index of the pencil's part that each pair belongs to (0
+            is the Neumann problem); otherwise None.
         next_eigenvalue: the first eigenvalue that is not kept; infinite if it does not exist or was not computed, as
-            for an interval. Derivatives treat it as a constant.
-        complete_below: the solver's certificate that it missed no eigenvalue below this bound (in an interval, none
-            between the lower end and the bound). The certificate follows from Sylvester's law of inertia, or from the
-            computation of all eigenvalues. NaN if there is no certificate. Derivatives treat the bound as a constant.
+            for an interval. Derivatives treat this number as a constant.
+        complete_below: a bound. The solver certifies that it missed no eigenvalue below the bound (for an interval,
+            between the lower end and the bound), by Sylvester's law of inertia or because it computed all eigenvalues.
+            The bound is NaN if there is no certificate. Derivatives treat the bound as a constant.
         spectral_origin: the reference point of relative errors: 0 if K ⪰ 0 is known, otherwise the lowest eigenvalue;
             for an interval its lower end.
         multiplet_tolerance: the gap, relative to the distance from `spectral_origin`, below which neighbouring
@@ -136,7 +134,7 @@ class Eigenpairs(eqx.Module):
 
     @property
     def n_null(self) -> int:
-        """The number of zero eigenvalues among the k.
+        """The number of zero eigenvalues among the k eigenvalues.
 
         Raises:
             ValueError: values are traced and the null space is unknown.
@@ -153,7 +151,7 @@ class Eigenpairs(eqx.Module):
 
     @property
     def cut_multiplet(self) -> Array:
-        """The number of kept pairs that belong to a multiple eigenvalue cut by the truncation; 0 if it cuts none."""
+        """The number of kept pairs of a multiple eigenvalue of which other pairs are not kept; 0 if there is none."""
         known = self.eigenvalues, self.kept, self.next_eigenvalue, self.spectral_origin, self.multiplet_tolerance
         return _cut_multiplet(*jax.lax.stop_gradient(known)) if self.k else jnp.zeros((), int)
 
@@ -161,7 +159,7 @@ class Eigenpairs(eqx.Module):
     def unconfirmed(self) -> Bool[Array, ""]:
         """Whether the solver's certificate ends before the last eigenvalue.
 
-        If a lower bound of the spectrum is known, the certificate is optional, because some solvers have none.
+        If a lower bound of the spectrum is known, this is false without a certificate, because some solvers give none.
         """
         if not self.k:
             return jnp.zeros((), bool)
@@ -171,7 +169,8 @@ class Eigenpairs(eqx.Module):
 
     @property
     def result(self) -> RESULTS:
-        """The most serious failure, a traceable code: compare with ``RESULTS.successful``, or call its ``error_if``."""
+        """The most serious failure, a traceable code. Compare it with ``RESULTS.successful``, or call its
+        ``error_if``."""
         finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(self.pencil) if eqx.is_inexact_array(leaf)]
         code: Any = RESULTS  # mypy sees its members as strings
         result = code.where(self.unconfirmed, code.unconfirmed, code.successful)
@@ -179,7 +178,7 @@ class Eigenpairs(eqx.Module):
         return code.where(jnp.all(jnp.stack(finite)), result, code.not_finite)
 
     def messages(self) -> list[str]:
-        """Return sentences that describe defects of these pairs. Needs concrete values."""
+        """Return sentences that describe defects of these pairs. Values must be concrete."""
         if not self.k:
             return []
         other = "allow more restarts" if "shift-invert" in self.solver_name else "another solver"
@@ -216,7 +215,7 @@ class Eigenpairs(eqx.Module):
         return sentences
 
     def summary(self) -> str:
-        """Describe size, method, range and quality in a few lines. Needs concrete values."""
+        """Describe size, method, range and quality in a few lines. Values must be concrete."""
         if not self.k:
             return "no eigenpairs: the interval contains no eigenvalue"
         values, residuals = np.asarray(self.eigenvalues), np.asarray(self.residuals)
@@ -236,7 +235,7 @@ class Eigenpairs(eqx.Module):
 
 
 def _anisotropy(pencil: AnyPencil | None) -> float:
-    """Return a high quantile of the tensors' eigenvalue ratios in a sample of the grid; 1 without a grid."""
+    """Return a high quantile of the tensors' eigenvalue ratios in a sample of the grid; 1 if there is no grid."""
     metric = None if pencil is None else pencil.parts[0].metric
     if metric is None or metric.spacing is None or not getattr(metric.tensors, "is_fully_addressable", True):
         return 1.0
@@ -250,7 +249,7 @@ def _anisotropy(pencil: AnyPencil | None) -> float:
 
 
 def multiplet_gap(xp: Any, values: Any, origin: Any, tolerance: Any) -> Any:
-    """Return the largest gap between each eigenvalue and the next at which the two count as equal, (*k)."""
+    """Return, for each eigenvalue, the largest gap to the next one at which the two count as equal, (*k)."""
     finfo = jnp.finfo(values.dtype)
     return tolerance * xp.maximum(xp.maximum(values - origin, finfo.eps * xp.abs(values)), finfo.tiny)
 
@@ -279,7 +278,7 @@ def truncate(pairs: Eigenpairs, k: int, multiplet: MultipletChoice) -> Eigenpair
     """Keep the lowest k pairs, or a different number if the cut would split a multiple eigenvalue.
 
     ``"report"`` keeps exactly k. If k cuts a multiple eigenvalue, ``"drop"`` excludes its pairs, unless no pair would
-    remain; ``"complete"`` includes all its pairs if they were computed, and otherwise drops it.
+    remain; ``"complete"`` includes all its pairs if they were computed, and otherwise excludes them.
     """
     known = pairs.eigenvalues, pairs.next_eigenvalue, pairs.spectral_origin, pairs.multiplet_tolerance
     chosen = _choose(*jax.lax.stop_gradient(known), k, multiplet)
@@ -290,7 +289,7 @@ def truncate(pairs: Eigenpairs, k: int, multiplet: MultipletChoice) -> Eigenpair
 def _choose(
     xp: Any, values: Any, following: Any, origin: Any, tolerance: Any, k: int, multiplet: MultipletChoice
 ) -> tuple[Any, Any]:
-    """Return a mask (n) of the kept pairs, and the eigenvalue after them."""
+    """Return a mask (n) of the kept pairs, and the first eigenvalue that is not kept."""
     size = len(values)
     sequence = xp.append(values, following)
     index = xp.arange(size)

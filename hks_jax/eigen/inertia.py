@@ -1,4 +1,4 @@
-"""Counts of eigenvalues by the inertia of factorisations, to locate the lower end of a spectrum and its density."""
+"""Counts of eigenvalues by the inertia of factorisations, and a search for the lower end of a spectrum."""
 
 import math
 from collections.abc import Callable
@@ -27,13 +27,13 @@ from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.traced import is_traced
 
 _BESIDE = (1e-6, 1e-5, 1e-4, 1e-3)
-"""Relative distances from σ at which to count if the factorisation at σ itself is too inaccurate."""
+"""Relative distances from a shift at which to count if the factorisation at the shift itself is too inaccurate."""
 _TRIES = 60
 """The maximal number of factorisations in a search."""
 _JUST_BELOW = 0.625
-"""The exponent of ε in the relative distance below zero at which a count is accurate, even if K is singular."""
+"""The exponent p of the first shift −ε^p λ of a search, where λ is an estimate of the largest eigenvalue."""
 _ALIKE = 1e-3
-"""The relative width of a bracket below which all of its eigenvalues count as one multiple eigenvalue."""
+"""The relative width of a bracket below which all eigenvalues in it count as one multiple eigenvalue."""
 _NARROW = 8
 """The width at which a bracket is not divided further, in units of the distance of the first shift from zero."""
 
@@ -47,18 +47,19 @@ Count = tuple[Number, Flag]
 def count_eigenvalues(
     domain: Any, below: Scalar | float, boundary: BoundarySpec = "neumann", mass: MassKind = "consistent"
 ) -> Number:
-    """Count the eigenvalues below a number, with their multiplicities.
+    """Count the eigenvalues below a number σ, with their multiplicities.
 
-    By Sylvester's law of inertia, this is the number of negative eigenvalues of K − σM. A factorisation LDLᵀ shows this
-    number. So one factorisation certifies that a list of eigenvalues is complete. Random right-hand sides test whether
-    the error of the factorisation could change its inertia. If σ is an eigenvalue of the domain or of a part of the
-    domain, the error may be too large; then the function counts on both sides of σ. Works under `jit`.
+    By Sylvester's law of inertia, the number of eigenvalues below σ is the number of negative eigenvalues of K − σM,
+    which a factorisation LDLᵀ shows. So one factorisation certifies that a list of eigenvalues is complete. Random
+    right-hand sides test whether the error of the factorisation could change its inertia. If σ is an eigenvalue of the
+    domain or of a part of the domain, the error may be too large; then the function counts on both sides of σ. The
+    function works under `jit`.
 
     Args:
         domain: a tensor field, a mesh, a pencil, K, or (K, M), as in `eigenpairs`.
         below: σ, in 1/(metric length)². The count is uncertain if σ is an eigenvalue.
-        boundary: see `assemble`. Only for fields and meshes.
-        mass: see `assemble`. Only for fields and meshes.
+        boundary: see `assemble`. This argument applies only to fields and meshes.
+        mass: see `assemble`. This argument applies only to fields and meshes.
 
     Returns:
         The number of eigenvalues less than σ; −1 if values are traced and the number is uncertain.
@@ -100,7 +101,7 @@ def count_below(pencil: AnyPencil, below: Scalar | float) -> Number:
         return jnp.where(sound, count, -1)
     if sound:
         return count
-    # If σ is near zero, the scale of distances is the expected size of the lowest positive eigenvalue.
+    # If the shift is near zero, distances are relative to the expected lowest positive eigenvalue.
     volume, dimension = pencil.volume, pencil.space.dimension
     least = 1e-6 * largest(pencil.parts[0]) if volume is None or dimension is None else volume ** (-2 / dimension)
     size = max(abs(float(shift)), float(least))
@@ -126,7 +127,7 @@ def _total(pencil: AnyPencil, shift: Scalar) -> Count:
 
 
 def certain_count(pencil: SymmetricPencil, shift: Scalar) -> Count:
-    """Return the number of eigenvalues of one pencil below σ, and whether this number is certain."""
+    """Return the number of eigenvalues of one pencil below a shift, and whether this number is certain."""
     return _certain_count(pencil, dissect(pencil.pattern), shift)
 
 
@@ -141,7 +142,7 @@ class LocatedPencil(SymmetricPencil):
     """The pencil of K − σ₀M and M, with counts of its spectrum near the origin σ₀. Its null space is unknown."""
 
     negative: Number  # the number of eigenvalues below the origin
-    first: Scalar  # the first shift; about the requested number of eigenvalues lie between it and the origin
+    first: Scalar  # the first shift; about the requested number of eigenvalues lie between the origin and it
     spacing: Scalar  # the mean gap of eigenvalues between the origin and `first`
 
 
@@ -154,21 +155,21 @@ def translated(
 
 
 class _Descent(NamedTuple):
-    """The state of the search for a distance below the origin that contains about as many eigenvalues as allowed."""
+    """The state of the search for a distance below the origin within which about as many eigenvalues lie as allowed."""
 
-    near: Scalar  # the largest distance so far that has at most the allowed number of eigenvalues; 0 at first
+    near: Scalar  # the largest distance so far within which at most the allowed number of eigenvalues lie; 0 at first
     number: Number  # the number of eigenvalues within `near`
-    far: Scalar  # the least distance so far that has too many eigenvalues; ∞ at first
-    next: Scalar  # the next distance to count at
+    far: Scalar  # the least distance so far within which too many eigenvalues lie; ∞ at first
+    next: Scalar  # the next distance at which to count
     tries: Number  # the number of counts so far
     going: Flag  # whether the search goes on
 
 
 def lowered(pencil: LocatedPencil, most: int, probes: int) -> tuple[Scalar, Number]:
-    """Return a distance below the origin, and the number of eigenvalues within this distance: `most`/2 to `most`.
+    """Return a distance below the origin, and the number of eigenvalues within this distance, from `most`/2 to `most`.
 
-    The number is smaller if no more eigenvalues exist, or if a multiple eigenvalue follows that would exceed `most`.
-    Each factorisation is tested with `probes` random right-hand sides.
+    The number is smaller if no more eigenvalues exist, or if the next eigenvalue is multiple and would make the number
+    exceed `most`. Each factorisation is tested with `probes` random right-hand sides.
     """
     count, dtype = _counting(pencil, probes), pencil.stiffness.dtype
 
@@ -202,22 +203,22 @@ class _Search(NamedTuple):
     low: Scalar  # the highest shift so far with no eigenvalue below it; −∞ at first
     high: Scalar  # the lowest shift so far with eigenvalues below it; ∞ at first
     number: Number  # the number of eigenvalues below `high`
-    first: Scalar  # the highest shift with `number` eigenvalues below it: far from them, solves are most accurate
-    next: Scalar  # the next shift to count at
+    first: Scalar  # the highest shift with `number` eigenvalues below it; solves there are most accurate
+    next: Scalar  # the next shift at which to count
     tries: Number  # the number of counts so far
     going: Flag  # whether the search goes on
 
 
 def locate(pencil: SymmetricPencil, wanted: int, probes: int) -> tuple[Scalar, Scalar, Number]:
-    """Return an origin below all eigenvalues, a shift above the lowest 1 to 2·wanted of them, and their number.
+    """Return an origin below all eigenvalues, a shift above the lowest 1 to 2·wanted eigenvalues, and their number.
 
     A bracket is halved, or divided in proportion to the counts, until it contains few enough eigenvalues. Each
     factorisation is tested with `probes` random right-hand sides. If many eigenvalues are equal within rounding, the
-    number exceeds 2·wanted. If the search fails, the result is NaN.
+    number exceeds 2·wanted. If the search fails, the origin and the shift are NaN.
     """
     size, count = scale(pencil), _counting(pencil, probes)
     infinite = jnp.full((), jnp.inf, size.dtype)
-    # A shift just below zero: a singular K ⪰ 0 has no eigenvalue below it, and the factorisation is still accurate.
+    # The first shift is just below zero. There, a singular K ⪰ 0 has the count 0 and an accurate factorisation.
     least = jnp.asarray(float(jnp.finfo(size.dtype).eps) ** _JUST_BELOW, size.dtype) * size
     none = jnp.zeros((), int)
 
@@ -271,7 +272,7 @@ def dissected(pencil: SymmetricPencil) -> Dissection:
 
 @jit_quickly()
 def scale(pencil: SymmetricPencil) -> Scalar:
-    """Estimate the largest eigenvalue by the row sums of |K| divided by the diagonal of M; return 1 if K is zero."""
+    """Estimate the largest eigenvalue by the largest ratio of a row sum of |K| to the diagonal of M; 1 if K is zero."""
     data, (rows, _) = pencil.stiffness.triplets()
     size = jnp.max(jax.ops.segment_sum(jnp.abs(data), rows, pencil.size) / pencil.mass.diagonal())
     return jnp.where(size > 0, size, 1)

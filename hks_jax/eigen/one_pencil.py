@@ -27,16 +27,16 @@ from hks_jax.linear.pencil import SymmetricPencil, tabulated
 from hks_jax.traced import is_traced
 
 _FAR = 30
-"""The largest distance of the origin below the wanted eigenvalues, in units of their spread."""
+"""The largest distance of the origin below the wanted eigenvalues, in units of the spread of these eigenvalues."""
 
 
 def widened(pencil: AnyPencil, solvers: Sequence[Eigensolver], k: int) -> AnyPencil:
-    """Return the pencil `on_all_nodes`, so that all masks share one compilation; but not for the dense solver."""
+    """Return the pencil `on_all_nodes`, so that masks share one compilation. For the dense solver, return `pencil`."""
     return pencil if any(isinstance(solver, Dense) for solver in solvers) else on_all_nodes(pencil, k)
 
 
 def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw: bool, report: Report) -> Eigenpairs:
-    """Return the k lowest pairs; with ``extra`` = 1 also the next eigenvalue. See `solved` for ``throw``."""
+    """Return the k lowest pairs and, if ``extra`` = 1, the next eigenvalue. See `solved` for ``throw``."""
     n_dof = pencil.size
     if isinstance(solver, ShiftInvert) and not pencil.bounded and is_concrete_on_cpu(jax.lax.stop_gradient(pencil)):
         bound = lower_bound(jax.lax.stop_gradient(pencil))
@@ -68,8 +68,7 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
         origin, first, below = locate(jax.lax.stop_gradient(pencil), half, solver.block)
         reach, spacing = first - origin, (first - origin) / jnp.maximum(below, 1).astype(origin.dtype)
         if not is_traced(below) and below > 2 * half:
-            # The lowest eigenvalue has a higher multiplicity than expected. Compute all its pairs, because `locate`
-            # counted them.
+            # The lowest eigenvalue has an unexpectedly high multiplicity. Compute all pairs that `locate` counted.
             number = max(k, int(below))
             method = solver if number + 1 <= solver.max_pairs(n_dof) else Dense(solver.tolerance)
 
@@ -85,7 +84,7 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
     spread = values[-1] - values[0]
     if not is_traced(values) and spread > indistinct(moved, values.dtype) and values[0] > _FAR * spread:
         # Solve again from an origin nearer to the spectrum, because distances from a remote origin have fewer correct
-        # digits. For equal eigenvalues, this does not matter.
+        # digits. For equal eigenvalues, this loss does not matter.
         origin = origin + values[0] - spread
         moved, found = solve(origin, 2 * spread, spread / number)
     if number > k:
@@ -108,7 +107,7 @@ class Interval(NamedTuple):
 def solve_interval(
     pencil: Pencil, interval: Interval, solver: BlockLanczos | Dense, throw: bool, report: Report
 ) -> Eigenpairs:
-    """Return the k eigenpairs in [low, high)."""
+    """Return the k eigenpairs in an interval."""
     low, high, below, held, k = interval
     length = high - low
     moved = translated(pencil, low, below, length / (2 * max(k / SLICE, 1)), length / max(k, 1))
@@ -208,7 +207,8 @@ def _quality(
     """Return residuals, convergence flags, flags of zero eigenvalues, and the multiplet tolerance.
 
     Residuals are relative to the distance of the eigenvalue from the origin. This distance is bounded below by the
-    first positive eigenvalue if the null space is known, otherwise by the mean gap; if all are zero, by the size of K.
+    first positive eigenvalue if the null space is known, by `largest_of` if all eigenvalues are zero, and otherwise by
+    the mean gap.
     """
     measure = measured_on_host if xp is np else measure_pairs
     (_, residuals, twice), k = measure(pencil, vectors, values), values.size

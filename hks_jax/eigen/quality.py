@@ -16,13 +16,13 @@ _EXCUSED = 0.01
 _ALIKE = 0.1
 """The inner product above which two normalised vectors count as the same eigenvector."""
 _ROWS = 8
-"""The number of vectors measured together: their images fit into the cache."""
+"""The number of vectors measured together, so that their images fit into the cache."""
 
 
 def measure_pairs(
     pencil: SymmetricPencil, vectors: Float[Array, "m n_dof"], values: Float[Array, " m"] | None = None
 ) -> tuple[Float[Array, " m"], Float[Array, " m"], Bool[Array, " m"]]:
-    """Return λ, ‖Kφ − λMφ‖ / ‖Mφ‖, and whether φ was found twice.
+    """Return, for each vector φ, the eigenvalue λ, the residual ‖Kφ − λMφ‖ / ‖Mφ‖, and whether φ was found twice.
 
     A vector counts as found twice if it is nearly parallel to one of the few vectors before it. If eigenvalues are not
     given, they are the Rayleigh quotients φᵀKφ / φᵀMφ, and vectors are not compared. In double precision, vectors are
@@ -68,21 +68,21 @@ def measured_on_host(
 def allowed_residuals(scale: Any, rounding: Any, tolerance: float, xp: Any = jnp) -> Any:
     """Return the largest residuals ‖Kφ − λMφ‖ / ‖Mφ‖ at which pairs count as converged.
 
-    The tolerance is relative to ``scale``: |λ|, or a typical eigenvalue if that is larger. Residuals up to the level of
-    rounding are accepted too, but at most one per cent of ``scale``, because a less accurate pair is useless.
+    The tolerance is relative to ``scale``, the larger of |λ| and a typical eigenvalue. Residuals up to the level of
+    rounding are accepted too, but only up to one per cent of ``scale``, because a less accurate pair is useless.
     """
     return xp.maximum(tolerance * scale, xp.minimum(rounding, _EXCUSED * scale))
 
 
 def indistinct(pencil: SymmetricPencil, dtype: np.dtype) -> Float[Array, ""]:
-    """Return 4 ε λ_max: two eigenvalues at a smaller distance are equal within the rounding of K."""
+    """Return 4 ε times the `largest` eigenvalue. Eigenvalues at a smaller distance are equal within rounding."""
     return 4 * jnp.finfo(dtype).eps * largest(pencil)
 
 
 def largest(pencil: SymmetricPencil) -> Float[Array, ""]:
-    """Estimate the largest eigenvalue by 4·max|Kᵢᵢ/Mᵢᵢ|, which is λ_max on a uniform grid in 2D and 3D.
+    """Estimate the largest eigenvalue by 4·max|Kᵢᵢ/Mᵢᵢ|, which is exact on a uniform grid in 2D and 3D.
 
-    If the diagonal of K is small, as of an adjacency matrix, the estimate is the mean of Σⱼ|Kᵢⱼ|, divided by max Mᵢᵢ.
+    The estimate is at least the mean over i of Σⱼ|Kᵢⱼ|, divided by max Mᵢᵢ, in case the diagonal of K is small.
     """
     return _largest(pencil.stiffness, pencil.mass)
 

@@ -1,4 +1,4 @@
-"""The interface of all eigensolvers, and the dense solver, which is the reference for every other."""
+"""The interface of all eigensolvers, and the dense solver, which is the reference for the other solvers."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -53,8 +53,8 @@ class Eigensolver(eqx.Module, Generic[P]):
         name: the name of the method in reports.
         indefinite: whether the method supports a stiffness that is indefinite, or whose null space is unknown.
         adjoint: the linear solver for derivatives. The default supports every pencil that can be factorised.
-        tolerance: the relative residual ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁) at which a pair counts as converged. If the
-            level of rounding is larger, it is used instead.
+        tolerance: the relative residual ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁) at which a pair counts as converged, or the
+            level of rounding if that is larger.
     """
 
     name: ClassVar[str]
@@ -69,8 +69,8 @@ class Eigensolver(eqx.Module, Generic[P]):
     def lowest(self, pencil: P, k: int, report: Report = silent) -> RawPairs:
         """Return the k lowest eigenvalues, ascending, M-orthonormal eigenvectors as rows, and a bound.
 
-        No eigenvalue below the bound was missed, except those after the k-th. Missing pairs are NaN, and the bound is
-        NaN if there is no certificate. Works under `jit` and `vmap`. Outside `jit`, it may report progress.
+        None of the k lowest eigenvalues is missing below the bound. Missing pairs are NaN, and the bound is NaN if
+        there is no certificate. The method works under `jit` and `vmap`; outside `jit`, it may report progress.
         """
 
     def guards(self, k: int, n_dof: int) -> int:
@@ -83,7 +83,7 @@ class Eigensolver(eqx.Module, Generic[P]):
 
 
 class Dense(Eigensolver[SymmetricPencil]):
-    """Dense solver: `eigh` of L⁻¹KL⁻ᵀ, where M = LLᵀ. Takes O(n³) time and O(n²) memory; finds all multiplicities.
+    """The dense solver: `eigh` of L⁻¹KL⁻ᵀ, where M = LLᵀ, in O(n³) time and O(n²) memory. It misses no eigenvalue.
 
     Examples:
         >>> flat = hj.TensorField(field.grid, np.tile(np.eye(2), (9, 9, 1, 1)))
@@ -95,7 +95,7 @@ class Dense(Eigensolver[SymmetricPencil]):
     tolerance: float = eqx.field(default=1e-8, static=True)
 
     def lowest(self, pencil: SymmetricPencil, k: int, report: Report = silent) -> RawPairs:
-        """Return the k lowest eigenpairs. Concrete values are handed to SciPy, which needs no compilation."""
+        """Return the k lowest eigenpairs. For concrete values, SciPy computes them, without compilation."""
         if not is_concrete_on_cpu(pencil):
             return _dense(pencil.stiffness.to_dense(), pencil.mass.to_dense(), k)
         data, matrices = host_matrices(pencil)

@@ -36,8 +36,8 @@ def weyl_count(
 
     In 2D, N(λ) ≈ (A λ ± L √λ)/4π, where A is the area and L is the length of the boundary. In 3D, N(λ) ≈ V λ^(3/2)/6π²
     ± S λ/16π, where V is the volume and S is the area of the boundary. The sign is plus for a natural boundary, and
-    minus for a Dirichlet boundary (Ivrii 1980). The boundary of a mask is the staircase of element faces; its full
-    length matters only if √λ times the spacing is close to 1.
+    minus for a Dirichlet boundary (Ivrii 1980). For a mask, L and S measure the staircase of element faces.
+    Eigenfunctions resolve its steps only if √λ times the spacing is close to 1.
 
     Args:
         problem: the result of `eigenpairs` or `assemble`, which has volume, dimension and boundary conditions.

@@ -1,7 +1,7 @@
 """Decisions that depend on whether computations run on an accelerator.
 
-On an accelerator, each kernel launch takes at least about 4 µs. If the host reads a number, it waits for all earlier
-kernels. So programs for accelerators have few kernels and static loop lengths, at the cost of additional arithmetic.
+On an accelerator, each kernel launch takes at least about 4 µs. If the host reads a number, the host waits for all
+earlier kernels. So programs for accelerators have few kernels and static loop lengths, but more arithmetic.
 """
 
 import warnings

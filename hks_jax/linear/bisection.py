@@ -25,8 +25,8 @@ _LANDMARKS = 8
 _SMOOTHING = 6
 """The number of times that each vertex's distances are averaged with its neighbours' distances, because many integer
 distances are equal. On random closed surfaces, the factors then have as many entries as with the vertices' positions as
-coordinates. They are 3 to 8 % larger than with METIS, whose nested dissection takes about as long; a factorisation
-takes 12 to 28 % more operations."""
+coordinates. The factors are 3 to 8 % larger than those from METIS, whose nested dissection takes about as long, and
+computing the factors takes 12 to 28 % more operations."""
 
 
 Ints = Int[np.ndarray, " _"]
@@ -84,8 +84,8 @@ def _banded(n: int, rows: Ints, cols: Ints) -> tuple[Ints, csr_matrix]:
     return order, graph
 
 
-# The gaps between components are as long as the components. With longer gaps, a single isolated vertex would determine
-# the principal axis.
+# In the additional coordinate, gaps between components are as long as the components. With longer gaps, a single
+# isolated vertex would determine the principal axis.
 def _coordinates(graph: csr_matrix) -> Float[np.ndarray, "n c"]:
     """Return distances from landmarks in each component; an additional coordinate places components in sequence."""
     n = graph.shape[0]

@@ -16,7 +16,7 @@ from hks_jax.linear.products import aligned, matmul
 
 _FAILURE = 1e-6
 _START = 30
-"""A factor for the nonuniform start of `lanczos_bound`, which exceeds the square root of the condition number of PD."""
+"""The safety factor of `lanczos_bound` for its start. It exceeds the square root of the condition number of PD."""
 
 Scalar = Float[Array, ""]
 Columns = Float[Array, "*shape b"]
@@ -42,8 +42,9 @@ def chebyshev_recurrence(
     return y, before, add(degree, y, total)
 
 
-# Let s(z) = (z − c)/e, where c and e are the interval's centre and half width. Divide the three-term recurrence of p by
-# p_j(ζ), and let σ_j = p_j(ζ)/p_{j+1}(ζ) = 1/(2s(ζ) − σ_{j−1}). Then z_j = q_j(A) w satisfies
+# Let s(z) = (z − c)/e, where c and e are the interval's centre and half width. Divide the three-term recurrence of the
+# Chebyshev polynomials p_j by p_j(ζ), and let σ_j = p_j(ζ)/p_{j+1}(ζ) = 1/(2s(ζ) − σ_{j−1}). Then z_j = q_j(A) w, where
+# q_j(z) = (p_j(z)/p_j(ζ) − 1)/(z − ζ), satisfies
 #
 #     z_{j+1} = (2σ_j/e) ((A − c) z_j + w) − σ_j σ_{j−1} z_{j−1},    z_0 = 0,   z_1 = (σ_0/e) w,   σ_0 = 1/s(ζ).
 #
@@ -59,13 +60,13 @@ def chebyshev_iteration(
     """Return q(A)w, where q(z) = (p(z)/p(ζ) − 1)/(z − ζ) and p is the Chebyshev polynomial of [low, high].
 
     If the spectrum of A lies in the interval, −q(A)w is the result of Chebyshev iteration for (A − ζ)x = w, with
-    residual p(A)w/p(ζ). ``product`` is x ↦ Ax.
+    residual p(A)w/p(ζ). ``product`` is x ↦ Ax, and ``value`` is ζ.
     """
     centre, half = (high + low) / 2, (high - low) / 2
     s = (value - centre) / half
 
     # On accelerators, each loop iteration takes two steps, so that new vectors overwrite old ones; with one step, XLA
-    # would copy both. If the number of steps is odd, an additional first step leads from z₀ = 0 to z₁.
+    # would copy both vectors. If the number of steps is odd, an additional first step leads from z₀ = 0 to z₁.
     together = 2 if accelerators.at_hand() else 1
     missing = jnp.asarray((degree - 1) % together)
 
@@ -87,7 +88,7 @@ def chebyshev_iteration(
     return jax.lax.fori_loop(0, (degree - 1 + missing) // together, turn, first)[1]
 
 
-# The coefficients of exp(−tλ) on 0 ≤ λ ≤ top are (−1)ⁿ 2 e^(−z) Iₙ(z), where z = t·top/2; for n = 0, half of that.
+# The coefficients of exp(−tλ) on 0 ≤ λ ≤ top are (−1)ⁿ 2 e^(−z) Iₙ(z) for n > 0 and e^(−z) I₀(z), where z = t·top/2.
 @partial(jax.jit, static_argnames="degree")
 def chebyshev_heat_coefficients(
     times: Float[Array, " m"], top: Scalar | float, degree: int
@@ -118,7 +119,7 @@ def least_degree(z: float, error: float) -> int:
 
 @jax.jit
 def gershgorin(entries: Float[Array, "offsets *shape"], inverse: Float[Array, "*shape"]) -> Float[Array, ""]:
-    """Return the Gershgorin bound of the spectrum of D⁻¹K, given the entries of K row by row, and D⁻¹."""
+    """Return the Gershgorin bound of the spectrum of D⁻¹K, given the entries of K row by row, and the diagonal D⁻¹."""
     return jnp.max(jnp.sum(jnp.abs(entries), axis=0) * inverse)
 
 

@@ -82,7 +82,7 @@ def remainder(x: Block, block: Block, parts: Parts, before: tuple[Block, Small] 
 
 
 def orthonormal(parts: Parts, columns: tuple[Block, ...], before: Small) -> tuple[tuple[Block, ...], Small]:
-    """Return columns times F⁻ᵀ, and ``before`` times F, where FFᵀ = G, given partial sums of G; G has at most 32 rows.
+    """Return the blocks ``columns`` times F⁻ᵀ, and ``before`` times F, where FFᵀ = G, given partial sums of G.
 
     If G = xᵀMx, the columns of xF⁻ᵀ are M-orthonormal. F is computed by pivoted Cholesky factorisation of G, scaled to
     unit diagonal. Pivots below rounding level, which belong to linearly dependent columns, are raised to this level.
@@ -136,8 +136,7 @@ def _combined(
     wanted: int,
     name: str,
 ) -> tuple[tuple[Block, ...], Small]:
-    """Return combinations of blocks, and a small matrix; ``small`` computes coefficients and matrix from the parts'
-    sum."""
+    """Return combinations of blocks, and a matrix; ``small`` computes coefficients and matrix from the summed parts."""
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 

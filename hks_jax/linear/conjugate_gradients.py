@@ -28,7 +28,7 @@ class Solution(NamedTuple):
     p: Float[Array, "n b"]  # the next search directions
     first: Float[Array, " b"]  # the initial rᵀz
     energy: Float[Array, " b"]  # the current rᵀz
-    change: Float[Array, " b"]  # the ratio of rᵀz to rᵀz in the previous step
+    change: Float[Array, " b"]  # the current rᵀz divided by the previous rᵀz
     errors: Float[Array, " b"]  # estimated relative errors divided by the wanted errors; at most 1 if converged
     going: Bool[Array, " b"]  # whether each column continues
     fresh: Bool[Array, ""]  # whether the next step is the first, or the first after a restart
@@ -61,9 +61,9 @@ def conjugate_gradients(
             must be symmetric and positive definite with respect to ``inner``.
         clean: the projection x ↦ Px on the subspace in which the Aᵢ are positive definite. If rounding has led x out of
             the subspace, an energy is not positive; then the iteration restarts from Px.
-        orthogonal: whether to reorthogonalise residuals, for one ill-conditioned matrix with expensive products (b = 1,
-            JAX only). Then ``product(x, first)`` returns the right-hand side if ``first`` is true, so that operations
-            common to it and to products are compiled once. Only the shape of ``rhs`` matters.
+        orthogonal: whether to reorthogonalise residuals, for one ill-conditioned matrix (b = 1) with expensive
+            products, in JAX. Then ``product(x, first)`` returns the right-hand side if ``first`` is true, so that
+            operations common to right-hand side and products are compiled once. Of ``rhs``, only the shape matters.
     """
     xp, n = rhs.__array_namespace__(), len(rhs)
 
@@ -94,11 +94,12 @@ def conjugate_gradients(
         x, r, again = state.x + wide * p, state.r - wide * image, begin
         kept = state.kept
         if kept is not None:
-            # In exact arithmetic rᵢᵀPrⱼ = 0 for i ≠ j, where P is the preconditioner. Rounding destroys this
-            # orthogonality once an extreme Ritz pair has converged, and the method then finds that eigenvector
-            # repeatedly. If eigenvalues decay over eight decades, this doubles the number of steps. If products are
-            # expensive and n is small, reorthogonalisation is cheaper (Paige 1971; Simon 1984). If the memory is full,
-            # the last place is overwritten, because the pairs that converged first need the early residuals.
+            # In exact arithmetic, residuals satisfy rᵢᵀPrⱼ = 0 for i ≠ j, where P is the preconditioner. Rounding
+            # destroys this orthogonality once an extreme Ritz pair has converged, and the method then finds that
+            # eigenvector repeatedly. If eigenvalues decay over eight decades, the repetitions double the number of
+            # steps. If products are expensive and n is small, reorthogonalisation is cheaper (Paige 1971; Simon 1984).
+            # If the memory is full, the last place is overwritten, because the early residuals keep the pairs that
+            # converged first from returning.
             at, root = jnp.clip(state.steps, 0, len(kept[0]) - 1), jnp.sqrt(state.energy)
             kept = kept[0].at[at].set(state.r[:, 0] / root), kept[1].at[at].set(state.z[:, 0] / root)
             r = r - matmul(kept[0].T, products_with_columns(kept[1], r))

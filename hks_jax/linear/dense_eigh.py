@@ -1,6 +1,6 @@
 """All eigenpairs of dense symmetric pencils, with derivatives that are finite at multiple eigenvalues.
 
-A Cholesky factorisation of B reduces a pencil to a standard eigenvalue problem.
+A Cholesky factorisation of B reduces Av = λBv to a standard eigenvalue problem.
 """
 
 from functools import partial
@@ -27,7 +27,7 @@ class DenseEigenpairs(NamedTuple):
     eigenvalues: Float[Array, " n"]
     """The eigenvalues in ascending order."""
     eigenvectors: Float[Array, "n n"]
-    """The eigenvectors as columns, orthonormal, or with vᵢᵀBvⱼ = δᵢⱼ."""
+    """The eigenvectors as columns: orthonormal or, for a pencil, with vᵢᵀBvⱼ = δᵢⱼ."""
 
 
 def eigh(A: Any, B: Any = None, *, multiplet_tolerance: float | None = None) -> DenseEigenpairs:
@@ -38,10 +38,10 @@ def eigh(A: Any, B: Any = None, *, multiplet_tolerance: float | None = None) -> 
     of f(λ) that include all equal eigenvalues, such as tr f(A).
 
     A single eigenvector of a multiple eigenvalue has no derivative. The rule returns an eigenvector derivative without
-    rotation within the eigenspace, and a diagonal entry of VᵀȦV as the derivative of each eigenvalue. **At a multiple
-    eigenvalue, the derivative of V f(Λ) Vᵀ through V and Λ is therefore wrong: use `matrix_function`**, which is exact
-    everywhere. No rule for V and Λ could be exact: at A = I the derivative of f(A) along Ȧ is f'(1) Ȧ, but Λ̇ and a
-    rotation of V give only the diagonal of VᵀȦV.
+    rotation within the eigenspace, and a diagonal entry of VᵀȦV as the derivative of each eigenvalue, where Ȧ is the
+    change of A. **At a multiple eigenvalue, the derivative of V f(Λ) Vᵀ through V and Λ is therefore wrong: use
+    `matrix_function`**, which is exact everywhere. No rule for V and Λ could be exact: at A = I the derivative of f(A)
+    along Ȧ is f'(1) Ȧ, but Λ̇ and a rotation of V give only the diagonal of VᵀȦV.
 
     Eigenvectors of nearly equal eigenvalues, and their derivatives, have errors of about ε|λ|/gap. Derivatives of
     functions of a whole cluster have the same errors, unless the gaps are below `multiplet_tolerance`.
@@ -50,7 +50,7 @@ def eigh(A: Any, B: Any = None, *, multiplet_tolerance: float | None = None) -> 
 
     Args:
         A: (n, n), symmetric, float32 or float64. Derivatives are with respect to the symmetric part of A.
-        B: (n, n), symmetric positive definite; None: the identity.
+        B: (n, n), symmetric positive definite; None means the identity.
         multiplet_tolerance: eigenvalues count as equal in derivatives if they differ by less than this, relative to the
             largest |λ|. None means 4nε, about the effect of rounding.
 
@@ -148,18 +148,18 @@ def _standard_form_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Arra
 
 @jax.custom_jvp
 def transposed_solve(factor: Matrix, columns: Float[Array, "n m"]) -> Float[Array, "n m"]:
-    """Return L⁻ᵀ times the columns."""
+    """Return L⁻ᵀ times the columns, where L is the lower triangular ``factor``."""
     return lapack.transposed_solve(factor, columns)
 
 
-# Lᵀx = c: ẋ = L⁻ᵀ(ċ − L̇ᵀx).
+# If Lᵀx = c, then ẋ = L⁻ᵀ(ċ − L̇ᵀx).
 @transposed_solve.defjvp
 def _transposed_solve_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
     x, (d_factor, d_columns) = transposed_solve(*primals), tangents
     return x, matmul(_triangular_inverse(primals[0]).T, d_columns - matmul(d_factor.T, x))
 
 
-# (L⁻¹)˙ = −L⁻¹L̇L⁻¹.
+# The derivative of L⁻¹ is −L⁻¹L̇L⁻¹.
 @jax.custom_jvp
 def _triangular_inverse(factor: Matrix) -> Matrix:
     return lapack.triangular_solve(factor, jnp.eye(len(factor), dtype=factor.dtype))

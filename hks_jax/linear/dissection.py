@@ -30,7 +30,7 @@ Ints = Int[np.ndarray, " _"]
 
 
 class Level(NamedTuple):
-    """The fronts of one level. A front eliminates s own nodes, and is coupled to r boundary nodes eliminated later.
+    """The fronts of one level. A front eliminates s own nodes; r boundary nodes coupled to it are eliminated later.
 
     In smaller fronts, indices are padded with the first number that is out of range.
     """
@@ -39,7 +39,7 @@ class Level(NamedTuple):
     # the places of the boundary nodes among the (fronts, s + r) nodes of the level above
     boundary: Int[np.ndarray, "fronts r"]
     # the places of the front's nodes among the (fronts, r) boundary nodes of the level below. A node has up to c such
-    # places; in an elimination tree, one for each child. Empty for cells
+    # places; in an elimination tree, one for each child. For cells, the array is empty
     children: Int[np.ndarray, "c fronts s_plus_r"]
 
     @property
@@ -71,8 +71,8 @@ class Dissection(NamedTuple):
     # the indices of the needed matrix entries in the array of entries; None means all entries in order
     entries: Int[np.ndarray, " m"] | None
     # the places of these entries in the concatenated blocks (fronts, s + r, s) of all levels. Of two entries equal by
-    # symmetry, only the one whose row is not eliminated before its column is needed. If all entries are listed, the
-    # others have places out of range
+    # symmetry, only the entry whose row is not eliminated before its column is needed. If all entries are listed,
+    # unneeded entries have places out of range
     places: Int[np.ndarray, " m"]
     padding: Int[np.ndarray, " p"]  # the places of the diagonal entries of padding nodes
     merged: Merged | None  # the merged tree for solves on accelerators; None if solves use the tree itself
@@ -98,8 +98,8 @@ def _dissect(pattern: Pattern, merge: bool) -> Dissection:
     above = np.flatnonzero(order_of_ends > 0)
     boundaries = _boundaries(level, front, depth, rows[above], cols[above])
     ranks = [within_groups(np.bincount(keys // n)) for keys in boundaries]
-    # The width is at least 1; if no front is coupled to its parent, this column is padding. On the first level, which
-    # has no parent, the width is 0.
+    # The width of the boundary arrays is at least 1; if no front is coupled to its parent, this column is padding. On
+    # the first level, which has no parent, the width is 0.
     width = [int(rank.max(initial=min(number, 1) - 1)) + 1 for number, rank in enumerate(ranks)]
     # List each boundary node's front, and the node's place among the own and boundary nodes of the parent.
     placed = [(keys // n, slot[keys % n]) for keys in boundaries]

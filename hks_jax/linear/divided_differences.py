@@ -11,10 +11,10 @@ Function = Callable[[Array], Array]
 
 
 def divided_difference(f: Function, low: Float[Array, "*n"], high: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Return f[a, b] = (f(b) − f(a))/(b − a) for a ≤ b, and f'(a) where they are equal.
+    """Return f[a, b] = (f(b) − f(a))/(b − a) for a ≤ b, and f'(a) where a = b.
 
-    This is also the mean of f' over the interval. The difference quotient is inaccurate for close a and b; Gauss
-    quadrature of the mean is inaccurate for distant a and b. `_mean_or_quotient` chooses between them.
+    The divided difference is also the mean of f' over [a, b]. The difference quotient is inaccurate for close a and b;
+    Gauss quadrature of the mean is inaccurate for distant a and b. `_mean_or_quotient` chooses one of the two.
     """
     gap = high - low
     slope = _derivative(f)
@@ -39,7 +39,7 @@ def second_divided_difference(
     above: Float[Array, "*n"],
     scale: Float[Array, ""],
 ) -> Float[Array, "*n"]:
-    """Return f[a, b, c] for a ≤ b ≤ c, and f''(a)/2 where they are equal, given f[a, b] and f[b, c].
+    """Return f[a, b, c] for a ≤ b ≤ c, and f''(a)/2 where a = b = c, given f[a, b] and f[b, c].
 
     The scale is the largest magnitude of all first divided differences. The error of the result is about the rounding
     error of the scale, also where f' is much smaller, as for f' = 1 − tanh².

@@ -25,7 +25,7 @@ from hks_jax.traced import is_traced
 _PROBES = 4
 """The number of random right-hand sides that test a factorisation."""
 _LEAST_PIVOT = 0.375
-"""The exponent of ε in the least pivot of a second factorisation."""
+"""The least pivot of a second factorisation is ε to this power, relative to the front's entries."""
 _DOUBTFUL = 0.01
 """The least error of determinants and inverses that causes a warning."""
 _BACKWARD = 4
@@ -57,7 +57,7 @@ class FactorisedMatrix(eqx.Module):
             inertia is that of A, and iterative refinement converges. Otherwise results are NaN.
         error: an estimate of ‖I − AF⁻¹‖ in the Frobenius norm, where F is the computed LDLᵀ. The error of log|det A|
             and the relative error of A⁻¹ are about as large. The estimate is infinite if pivots were replaced; then
-            log|det A| and A⁻¹ are NaN. Solutions are refined, and more accurate.
+            log|det A| and A⁻¹ are NaN. Solutions are more accurate, because they are refined.
     """
 
     matrix: PatternedOperator
@@ -75,7 +75,7 @@ class FactorisedMatrix(eqx.Module):
 
     @property
     def inertia(self) -> Inertia:
-        """Counts of A's negative and positive eigenvalues; for K − σM, of the pencil's eigenvalues λ < σ and λ > σ."""
+        """The numbers of negative and positive eigenvalues; for A = K − σM, of the pencil's eigenvalues < σ and > σ."""
         negative = self.factor.negative
         counts = negative, jnp.asarray(self.size, negative.dtype) - negative
         return Inertia(*(jnp.where(self.sound, count, -1) for count in counts))
@@ -98,7 +98,7 @@ class FactorisedMatrix(eqx.Module):
         return _nan_unless(self.sound, x)
 
     def logdet(self) -> Scalar:
-        """Return log|det A|; `sign` has the sign.
+        """Return log|det A|; `sign` is the sign of det A.
 
         Raises:
             ValueError: pivots were replaced, and values are concrete.
@@ -140,7 +140,7 @@ def _nan_unless(known: Bool[Array, ""], x: Float[Array, "*shape"]) -> Float[Arra
 
 
 def factorised(matrix: PatternedOperator, name: str = "matrix") -> FactorisedMatrix:
-    """Factorise a symmetric matrix A. Only one of each pair of entries equal by symmetry is read.
+    """Factorise a symmetric matrix A. Of two entries that are equal by symmetry, only one is read.
 
     Raises:
         ValueError: A is concrete, and singular or not finite. The message begins with ``name``.
@@ -152,7 +152,7 @@ def factorised(matrix: PatternedOperator, name: str = "matrix") -> FactorisedMat
     factor, trial, tries = certain_factorisation(dissection, known, jnp.zeros((), matrix.dtype))
     if not is_traced(trial) and not trial.sound:
         raise ValueError(_failure(name, known, factor))
-    # For a random unit vector v, ‖Ev‖ is about the Frobenius norm of E divided by √n.
+    # For any matrix E and a random unit vector v, ‖Ev‖ is about the Frobenius norm of E divided by √n.
     error = jnp.where(trial.sound & (tries == 1), trial.rate * math.sqrt(matrix.size), jnp.inf)
     return FactorisedMatrix(pencil.stiffness, factor, trial.sound, error)
 
@@ -160,7 +160,7 @@ def factorised(matrix: PatternedOperator, name: str = "matrix") -> FactorisedMat
 def certain_factorisation(
     dissection: Dissection, pencil: SymmetricPencil, shift: Scalar
 ) -> tuple[Factorisation, Trial, Int[Array, ""]]:
-    """Factorise K − σM, if necessary again with small pivots replaced; return factors, `Trial` and number of tries."""
+    """Factorise K − σM, and again with small pivots replaced if necessary; return factors, `Trial`, number of tries."""
     probes = jax.random.normal(jax.random.key(0), (pencil.size, _PROBES), shift.dtype)
     bounded, matrix = float(jnp.finfo(shift.dtype).eps) ** _LEAST_PIVOT, pencil.shifted(shift)
 
@@ -216,8 +216,8 @@ def _norm(matrix: PatternedOperator) -> Scalar:
     return jnp.max(matrix.with_flat(jnp.abs(matrix.flat())).of_columns()(ones))
 
 
-# A dx = db − dA x. JAX derives all derivatives of a linear solve from the product with A. The solution method does not
-# enter these derivatives.
+# If A x = b, then A dx = db − dA x. JAX derives all derivatives of a linear solve from the product with A. The solution
+# method does not enter these derivatives.
 @jax.jit
 def _solve(matrix: PatternedOperator, factor: Factorisation, b: Columns) -> Columns:
     product, norm = matrix.of_columns(), jax.lax.stop_gradient(_norm(matrix))
@@ -225,7 +225,7 @@ def _solve(matrix: PatternedOperator, factor: Factorisation, b: Columns) -> Colu
 
 
 def _refined(factor: Factorisation, norm: Scalar, product: OfColumns, b: Columns) -> Columns:
-    """Solve with iterative refinement, as long as a step at least halves the largest backward error."""
+    """Solve with iterative refinement, as long as each step at least halves the largest backward error."""
     finfo = jnp.finfo(b.dtype)
 
     def largest(x: Array) -> Float[Array, " m"]:
@@ -248,7 +248,7 @@ def _refined(factor: Factorisation, norm: Scalar, product: OfColumns, b: Columns
 
 
 def _eliminated(matrix: Float[Array, " m"], factor: Factorisation) -> Eliminated:
-    """Return (A⁻¹, BA⁻¹) for the elimination tree; if solves use a merged tree, eliminate the matrix again."""
+    """Return the result of `eliminate`; compute it again only if solves use a merged tree."""
     tree = factor.dissection
     if tree.merged is not None:
         return eliminate(tree, matrix, lambda blocks, _: symmetric_inverses(blocks)[0])
@@ -257,7 +257,8 @@ def _eliminated(matrix: Float[Array, " m"], factor: Factorisation) -> Eliminated
 
 
 # Only some entries of d(A⁻¹) = −A⁻¹ dA A⁻¹ are needed. The rule differentiates the elimination and the recurrence from
-# the first separator to the cells; its transpose takes a few times as many operations. Values use the factors.
+# the first separator to the cells; its transpose takes a few times as many operations. The values come from the
+# factors.
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _inverse(diagonal: bool, matrix: Float[Array, " m"], factor: Factorisation) -> Float[Array, " n"]:
     return selected(factor.dissection, _eliminated(matrix, factor), diagonal)

@@ -3,8 +3,7 @@
 jaxlib 0.10.0 to 0.11.0 distribute a batch of LAPACK calls over the CPU's thread pool, and the calling thread waits for
 them (`ParallelBatchMap`). If the calling threads belong to the pool and occupy all of it, no thread does the work. On
 two cores, two independent batched calls in one program hang within a hundred calls. A call on one matrix does not wait.
-So this package calls LAPACK only through this file, matrix by matrix. Then a user's own batched call also finds free
-threads.
+So this package calls LAPACK only through this file, matrix by matrix. Then a user's batched call finds free threads.
 """
 
 from collections.abc import Callable

@@ -18,7 +18,8 @@ Tree = TypeVar("Tree")
 
 
 # In reverse mode, JAX replaces a function with a custom rule by its body if the function is linear in an unknown
-# tangent. An outer derivative then differentiates that body. However, JAX does not replace a linear solve. The system
+# tangent. An outer derivative then differentiates that body. However, JAX does not replace a linear solve. For a linear
+# map F, the system
 #
 #     ⎡ 0   I ⎤ ⎡u⎤   ⎡b⎤             ⎡ 0   F ⎤
 #     ⎣ I  −S ⎦ ⎣v⎦ = ⎣c⎦,        S = ⎣ Fᵀ  0 ⎦,
@@ -38,10 +39,10 @@ def linear_map(function: LinearMap, derivative: Derivative, at: Any, constants: 
 
 
 def with_transpose(forward: Callable[[Any], Any], backward: Callable[[Any], Any], x: Any, at: Any = ()) -> Any:
-    """Return y = ``forward(x)``, linear in x, whose transpose is ``backward``; JAX itself transposes neither.
+    """Return y = ``forward(x)``, linear in x, whose transpose is ``backward``; JAX transposes neither function.
 
     Both x and y are pytrees of floating point arrays. ``at`` contains the other variables of the two functions;
-    derivatives with respect to these have custom rules.
+    derivatives with respect to ``at`` have custom rules.
     """
 
     # JAX transposes a solve only if its whole right-hand side depends on the linearised variables, x or `at`.

@@ -1,6 +1,6 @@
 """Loops that run in Python for concrete values, where they can be interrupted, and in XLA for traced values.
 
-On CPUs, a batch of problems is also a loop, because solving them together is not faster.
+On CPUs, a batch of problems is also solved in a loop, because solving the problems together is not faster.
 """
 
 import contextlib
@@ -55,13 +55,13 @@ def when(condition: Any, function: Callable[[State], State], state: State) -> St
 
 
 # In a vectorised batch, every loop runs until its last problem has finished, both branches of conditions are computed,
-# and the factorisations exceed a CPU's cache. This took three times as long as solving the problems in sequence. On an
-# accelerator, however, a single problem leaves most of the device idle.
+# and the factorisations exceed a CPU's cache. In measurements, a batch took three times as long as the problems in
+# sequence. On an accelerator, however, a single problem leaves most of the device idle.
 def one_by_one(function: Callable[..., Any], settings: tuple[Hashable, ...], *args: Any) -> Any:
     """Return function(*settings, *args). Under `vmap` on a CPU, the problems of a batch run in sequence.
 
-    The result is not differentiable, but derivative rules may call this. The function must be traceable, and the same
-    object in every call, so that it is compiled once. Settings are static.
+    The result is not differentiable, but derivative rules may call `one_by_one`. ``function`` must be traceable, and
+    the same object in every call, so that it is compiled once. Settings are static.
     """
     if not is_traced(args):
         # Without this context, JAX would compile the primal part of a derivative again outside `jit`.

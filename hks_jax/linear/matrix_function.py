@@ -17,8 +17,7 @@ from hks_jax.linear.products import matmul
 
 Matrix = Float[Array, "n n"]
 Function = Callable[[Any, Any, Array], Array]
-"""f(parameters, others, x), elementwise in x. ``parameters`` is a pytree of real arrays, and ``others`` of the other
-arrays."""
+"""f(parameters, others, x), elementwise in x. ``parameters`` has all real arrays; ``others`` has the other arrays."""
 
 
 def matrix_function(A: Any, f: Callable[[Array], Any], B: Any = None) -> Float[Array, "n n"]:
@@ -36,10 +35,10 @@ def matrix_function(A: Any, f: Callable[[Array], Any], B: Any = None) -> Float[A
 
     Args:
         A: (n, n), symmetric, float32 or float64. Derivatives are with respect to the symmetric part of A.
-        f: a function of JAX operations that maps one eigenvalue, a scalar, to a real scalar. It is also evaluated
+        f: a function of JAX operations that maps one eigenvalue, a scalar, to a real scalar. f is also evaluated
             between eigenvalues. First derivatives use f', second derivatives f''. Between eigenvalues, f need not be
             smooth; so ``lambda x: x < c`` gives the projector on the eigenvectors with λ < c.
-        B: (n, n), symmetric positive definite; None: the identity.
+        B: (n, n), symmetric positive definite; None means the identity.
 
     Returns:
         The symmetric matrix f(A), (n, n). It is NaN if f returns NaN, as for the logarithm of a negative eigenvalue.
@@ -145,7 +144,7 @@ def _table(f: Callable[[Array], Array], values: Float[Array, " n"]) -> Matrix:
 
 
 def _table_along(f: Function, parameters: Any, others: Any, values: Float[Array, " n"], change: Any) -> Matrix:
-    """Return [∂f]. It is linear in the change, because whether `_table` uses a mean or a quotient depends only on f."""
+    """Return [∂f], which is linear in the change: whether `_table` uses a mean or a quotient depends only on f."""
     return jax.jvp(lambda p: _table(partial(f, p, others), values), (parameters,), (change,))[1]
 
 
@@ -166,6 +165,6 @@ def _mixed(f: Callable[[Array], Array], values: Float[Array, " n"], table: Matri
 
 
 def _compose(vectors: Matrix, inner: Matrix) -> Matrix:
-    """Return the symmetric part of V X Vᵀ."""
+    """Return the symmetric part of V X Vᵀ, where V are the eigenvectors and X is ``inner``."""
     full = matmul(vectors, inner, vectors.T)
     return (full + full.T) / 2

@@ -1,8 +1,8 @@
 """The multifrontal LDLᵀ factorisation of K − σM, for linear solves, and for eigenvalue counts by its inertia.
 
 The computation is batched dense algebra, with one batch for each level of the nested dissection. In 2D, a factorisation
-takes O(N^1.5) operations and a solve O(N log N), in O(log N) sequential steps. The same code runs on every device,
-under `jit` and `vmap`.
+takes O(N^1.5) operations and a solve O(N log N), in O(log N) sequential steps. The code runs on every device, under
+`jit` and `vmap`.
 """
 
 import math
@@ -66,7 +66,7 @@ class Factorisation(eqx.Module):
 class Trial(NamedTuple):
     """The measured accuracy of a factorisation."""
 
-    sound: Bool[Array, ""]  # whether its inertia equals that of K − σM
+    sound: Bool[Array, ""]  # whether the factors have the inertia of K − σM
     # ‖b − (K − σM)x‖/‖b‖ of solutions x for random b, which estimates the convergence rate of iterative refinement
     rate: Scalar
     # the largest ‖(K − σM)x − b‖/‖Mx‖ of M-orthonormal solutions x. Residuals of eigenpairs near σ cannot be smaller;
@@ -75,15 +75,15 @@ class Trial(NamedTuple):
 
 
 # If the shift is an eigenvalue of a part of the domain, a pivot vanishes. A pivot δ causes Schur complements of size
-# 1/δ and, with the explicit inverses of the next front, errors of ε/δ². Replacing it by the least allowed pivot
-# perturbs the matrix by at most twice that pivot. Both errors balance near ε^(1/3), which bounds the error of every
-# factorisation (static pivoting, Li and Demmel 1998). In measurements, ε^(3/8) is best for counts. Solves need more
-# accuracy, and small pivots may be harmless, as on a thin domain or with a nearly decoupled component.
+# 1/δ and, with the explicit inverses of the next front, errors of ε/δ². Replacing δ by the least allowed pivot perturbs
+# the matrix by at most twice that pivot. Both errors balance if the least pivot is near ε^(1/3), which bounds the error
+# of every factorisation (static pivoting, Li and Demmel 1998). In measurements, ε^(3/8) is best for counts. Solves need
+# more accuracy, and small pivots may be harmless, as on a thin domain or with a nearly decoupled component.
 def factorise(dissection: Dissection, matrix: Float[Array, " m"], least: Scalar | None = None) -> Factorisation:
     """Factorise a symmetric matrix, without pivoting between fronts; `try_out` measures the accuracy.
 
     The matrix is given by its entries at the places of the pattern, as from `SymmetricPencil.shifted`. Pivots smaller
-    than ``least``, relative to the entries of the front, are replaced by it.
+    than ``least``, relative to the entries of the front, are replaced by ±``least``.
     """
     return Factorisation(dissection, *_eliminate(dissection, matrix, least))
 
@@ -118,7 +118,7 @@ def try_out(factor: Factorisation, pencil: SymmetricPencil, shift: Scalar, b: Fl
 
 def _error(x: Float[Array, "n b"], image: Float[Array, "n b"], residual: Float[Array, "n b"]) -> Scalar:
     """Return `Trial.error`, given solutions x, Mx, and residuals."""
-    # Solutions are dominated by the eigenvector nearest to the shift, so the error is measured on orthonormal vectors.
+    # Solutions are dominated by the eigenvector nearest to the shift, so errors are measured on orthonormal vectors.
     products = gram(x, image)
     norms = jnp.sqrt(jnp.diagonal(products))
     # For such a small matrix, the inverse is accurate enough and faster than a long triangular solve.
@@ -131,7 +131,7 @@ def _error(x: Float[Array, "n b"], image: Float[Array, "n b"], residual: Float[A
 def _eliminate(
     dissection: Dissection, matrix: Float[Array, " m"], least: Scalar | None
 ) -> tuple[Blocks, Blocks, Float[Array, " pivots"]]:
-    """Return the matrices downward and upward, and the pivots."""
+    """Return ``downward``, ``upward`` and ``pivots`` of `Factorisation`."""
     pivots = []
 
     def inverted(blocks: Array, sizes: Array) -> Array:
@@ -173,7 +173,7 @@ def eliminate(
 
     ``invert`` maps symmetric blocks (fronts, s, s), and the largest absolute value of each front's entries, to
     inverses. The result is (A⁻¹, BA⁻¹) for the fronts of each level. Here A is a front's own block and B its coupling
-    to its boundary, both with the Schur complements of the fronts below added.
+    to its boundary; both include the Schur complements of the fronts below.
     """
     start = list(accumulate((math.prod(level.shape) for level in dissection.levels), initial=0))
     needed = matrix if dissection.entries is None else taken(matrix, dissection.entries)
@@ -200,7 +200,7 @@ def eliminate(
 def _substituted(
     levels: tuple[Level, ...], downward: Blocks, upward: Blocks, rhs: Float[Array, "n b"]
 ) -> tuple[Float[Array, "m b"], Float[Array, "fronts r b"]]:
-    """Solve along levels, with x = 0 at the boundary of the first; return x at own nodes, and the boundary residual."""
+    """Solve along levels; x = 0 at the boundary of the first. Return x at own nodes, and the boundary residual."""
     width = rhs.shape[1]
     own: list[Array] = []
     passed: Array | None = None

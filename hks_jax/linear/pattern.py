@@ -77,8 +77,7 @@ class SparsePattern(ByKey, Pattern):
 
     @cached_property
     def table(self) -> Ellpack:
-        """The pattern as a table. Its width minimises the cost of products: a few long rows do not increase the
-        width."""
+        """The pattern as a table, whose width minimises the cost of products even if a few rows are long."""
         counts = np.bincount(self.rows, minlength=self.size)
         start = np.cumsum(counts) - counts
         longer = np.cumsum(np.bincount(counts)[::-1])[::-1][1:]  # the number of rows with more than 0, 1, … entries

@@ -62,7 +62,7 @@ class SymmetricPencil(eqx.Module):
 
 
 P = TypeVar("P", bound=SymmetricPencil)
-"""The type of pencil that a solver supports: any pencil, those of a domain, or those of a grid."""
+"""The type of pencil that a solver supports: any pencil, pencils of domains, or pencils of grids."""
 
 
 def tabulated(pencil: P) -> P:

@@ -16,14 +16,14 @@ from hks_jax.linear.linear_map import with_transpose
 
 _MANY, _TERMS = 512, 40
 """The least number of matrices, and their largest number of columns, for which a CPU sums batched products term by
-term. For others, compilation would take longer than the gain."""
+term. For other batches, compilation would take longer than the gain."""
 _ROWS, _LARGE = (4, 5, 3, 7, 2), 1 << 18
 """The numbers of rows of a large array (at least ``_LARGE`` numbers) that are multiplied together in the cache. The
 first divisor of the number of rows is used, because a remainder would be copied."""
 
 
 def products_with_columns(basis: Float[Array, "m n"], columns: Float[Array, "n c"]) -> Float[Array, "m c"]:
-    """Return the inner products of rows and columns.
+    """Return the inner products of the rows of ``basis`` with the columns.
 
     XLA's CPU kernels for long contractions are many times faster with the large factor on the left. The barrier keeps
     XLA from exchanging the factors.
@@ -32,7 +32,7 @@ def products_with_columns(basis: Float[Array, "m n"], columns: Float[Array, "n c
 
 
 def inner_products(basis: Float[Array, "m n"], block: Float[Array, "b n"]) -> Float[Array, "b m"]:
-    """Return the inner products of rows. The result is (b, m), the layout in which later products are fastest."""
+    """Return the inner products of rows. With this layout (b, m) of the result, later products are fastest."""
     if len(basis) < len(block):
         return products_with_columns(block, basis.T)  # the larger factor on the left
     return jax.lax.optimization_barrier(products_with_columns(basis, block.T).T)

@@ -1,7 +1,7 @@
 """Selected inversion: the entries of the inverse of a sparse symmetric matrix on its sparsity pattern.
 
-The method is that of Takahashi, Fagan and Chin (1973), on the elimination tree. Let a front have the own block A at its
-elimination, the coupling B to its boundary, and C = BA⁻¹. Then the inverse G of the whole matrix satisfies
+The method is that of Takahashi, Fagan and Chin (1973), on the elimination tree. At a front's elimination, let A be its
+own block, B its coupling to its boundary, and C = BA⁻¹. Then the inverse G of the whole matrix satisfies
 
     G_own = A⁻¹ + Cᵀ G_b C,    G_b,own = −G_b C,
 
@@ -27,11 +27,11 @@ Eliminated = list[tuple[Inexact[Array, "_fronts _s _s"], Inexact[Array, "_fronts
 def inverse_entries(
     dissection: Dissection, matrix: Inexact[Array, " m"], diagonal: bool = True
 ) -> Inexact[Array, " entries"]:
-    """Return the entries of `selected` for the inverse of a symmetric matrix, real or complex (not Hermitian).
+    """Eliminate a symmetric matrix, real or complex (not Hermitian), and return `selected` entries of its inverse.
 
-    The elimination does not pivot between fronts. This is safe if the real or imaginary part of the matrix is definite,
-    because then no Schur complement is singular. The function is differentiable in both modes; reverse mode stores
-    several copies of the factors.
+    The elimination does not pivot between fronts. Elimination without pivoting is safe if the real or imaginary part of
+    the matrix is definite, because then no Schur complement is singular. The function is differentiable in both modes;
+    reverse mode stores several copies of the factors.
     """
     return selected(dissection, eliminate(dissection, matrix, lambda blocks, _: _inverses(blocks)), diagonal)
 

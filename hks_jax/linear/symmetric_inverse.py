@@ -16,8 +16,8 @@ Pivots = Float[Array, " m"]
 Inverses = tuple[Matrices, Float[Array, "m n"]]
 
 _BLOCK, _BLOCKS, _LARGE = 48, 4, 2048
-"""On CPUs, matrices of up to ``_BLOCK`` rows are inverted by their eigenvalues. Those of up to ``_LARGE`` rows are
-swept in about ``_BLOCKS`` blocks."""
+"""On CPUs, matrices of up to ``_BLOCK`` rows are inverted by their eigenvalues. Larger matrices of up to ``_LARGE``
+rows are swept in about ``_BLOCKS`` blocks."""
 _ROWS = 32
 """The largest size of blocks that are swept row by row."""
 _MANY = 128
@@ -53,7 +53,7 @@ def _kernel_agrees(dtype: Any) -> bool:
 
 
 def by_cholesky_factors(matrices: Matrices, least: Pivots) -> Inverses:
-    """Invert by Cholesky factors, or by eigenvalues, three times as slow, if a pivot is negative or small."""
+    """Invert by Cholesky factors or, if a pivot is small or not positive, by eigenvalues in three times the time."""
     inverses = jax.vmap(lapack.inverse_cholesky)(matrices)
     pivots = jnp.diagonal(inverses, axis1=1, axis2=2) ** -2
     return jax.lax.cond(
@@ -64,7 +64,7 @@ def by_cholesky_factors(matrices: Matrices, least: Pivots) -> Inverses:
 
 
 def by_eigenvalues(matrices: Matrices, least: Pivots) -> Inverses:
-    """Invert small matrices by their eigenvalues, and others by sweeping blocks, which the same function inverts.
+    """Invert small matrices by their eigenvalues, and others by sweeping blocks, which are inverted recursively.
 
     Large blocks are in turn swept in small blocks, which needs few passes over the matrix. The largest matrices are
     divided into halves, which takes fewer operations.
@@ -124,7 +124,7 @@ def _by_blocks(invert: Callable[[Array, Array], Inverses], size: int, matrices: 
         return _swept(a, rows, inverses, at), jax.lax.dynamic_update_slice_in_dim(pivots, of_block, at, axis=1)
 
     a, pivots = jax.lax.fori_loop(0, whole // size, sweep, (a, jnp.zeros((m, whole), a.dtype)))
-    # All these pivots except one are positive: the padding has pivots 1, and eigenvalues that displace them are larger.
+    # Padding rows have pivots 1; larger eigenvalues may take their places. So all these pivots except one are positive.
     last = jnp.prod(pivots[:, n - 1 :], axis=1, keepdims=True)
     return -a[:, :n, :n], jnp.concatenate([pivots[:, : n - 1], last], axis=1)
 

@@ -2,10 +2,10 @@
 
 Derivatives of a truncated spectrum need linear solves with K − λᵢM on the M-orthogonal complement of the p lowest
 eigenvectors. On this complement, K − σM is positive definite for *every* σ below the next eigenvalue Λ, even if it is
-indefinite on the whole space. If K − λᵢM is preconditioned with K − σM, its spectrum lies between 1 and
-(Λ − λᵢ)/(Λ − σ). So right-hand sides (rows) are grouped by λᵢ, and each group has its own shift σ. A few factorisations
-then suffice for fast convergence of all rows. `HostAdjoint` uses SciPy's factorisations, `FactorisedAdjoint` those
-in JAX, and `FilteredAdjoint` a polynomial.
+indefinite on the whole space. If K − λᵢM is preconditioned with K − σM, its spectrum lies between 1 and (Λ − λᵢ)/(Λ −
+σ). So right-hand sides (rows) are grouped by λᵢ, and each group has its own shift σ. A few factorisations then suffice
+for fast convergence of all rows. `HostAdjoint` uses SciPy's factorisations, `FactorisedAdjoint` uses factorisations in
+JAX, and `FilteredAdjoint` uses a polynomial.
 """
 
 from abc import abstractmethod
@@ -37,11 +37,11 @@ Columns = Float[Array, "n_dof b"]
 Shifts = Float[Array, " groups"]
 
 SINGULAR = 1e-8
-"""The gap, relative to the last eigenvalue, below which K − λᵢM counts as singular on the complement."""
+"""The Rayleigh quotient below which K − λᵢM counts as singular, relative to the first eigenvalue on the complement."""
 _LEAST = 100
-"""The least tolerance, and the norm below which a projected row counts as zero, both relative and in units of ε."""
+"""In units of ε: the least relative tolerance, and the relative norm below which a projected row counts as zero."""
 _FACTORISATION = 200
-"""The cost of a factorisation in solves of one row: about 100, but doubled, because small rows take few steps."""
+"""The cost of a factorisation in solves of one row. About 100 is doubled, because small rows take few steps."""
 _MOST_GROUPS = 16
 _ROWS = 128
 """The number of rows projected together; with fewer rows, the eigenvectors are read from memory more often."""
@@ -50,12 +50,11 @@ _ROWS = 128
 class Adjoint(eqx.Module, Generic[P]):
     """A linear solver with K − λᵢM on the complement of the computed eigenvectors; all settings are static.
 
-    Every eigensolver has a default in its field ``adjoint``; any other `Adjoint` that supports the pencil may replace
-    it.
+    The field ``adjoint`` of each eigensolver has a default; any `Adjoint` that supports the pencil may replace it.
 
     Attributes:
-        tolerance: the error in the energy norm, relative to the largest row. Rounding errors of eigenvectors bound it
-            from below.
+        tolerance: the wanted error in the energy norm, relative to the largest row. Because of the rounding errors of
+            eigenvectors, the error has a lower bound.
     """
 
     tolerance: eqx.AbstractVar[float]
@@ -71,7 +70,7 @@ class Adjoint(eqx.Module, Generic[P]):
     def solve(self, prepared: Any, pencil: P, values: Values, vectors: Vectors, rhs: Rows) -> Rows:
         """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0, where Q = I − MΦΦᵀ, p ≥ k and p < n_dof.
 
-        ``prepared`` is the result of `prepare`. Rows that did not converge are NaN. Works under `jit`.
+        ``prepared`` is the result of `prepare`. Rows that did not converge are NaN. The method works under `jit`.
         """
 
 
@@ -98,7 +97,7 @@ def first_beyond(values: Values) -> Scalar:
 
 
 def amplification(values: Values, k: int) -> OfRows:
-    """Return Λ/(Λ − λᵢ), the norms of the inverses on the complement, relative to the norm for λ = 0."""
+    """Return Λ/(Λ − λᵢ): the norm of (K − λᵢM)⁻¹ on the complement, relative to the norm for λᵢ = 0."""
     beyond = first_beyond(values)
     return beyond / (beyond - values[:k])
 
@@ -129,7 +128,7 @@ def wanted_errors(before: OfRows, after: OfRows, amplified: OfRows, tolerance: f
 
 
 def norms(rows: Rows, lumped: Float[Array, " n_dof"]) -> OfRows:
-    """Return ‖rᵢ‖ in the norm of D⁻¹, where D is the diagonal of M."""
+    """Return √(rᵢᵀD⁻¹rᵢ) for each row rᵢ, where D is the lumped mass."""
     xp = rows.__array_namespace__()
     return xp.sqrt(xp.sum(rows * rows / lumped[None], axis=1))
 
@@ -137,10 +136,10 @@ def norms(rows: Rows, lumped: Float[Array, " n_dof"]) -> OfRows:
 def group_numbers(
     distance: Float[np.ndarray, " m"], rows: int, tolerance: float, most: int = _MOST_GROUPS
 ) -> Int[np.ndarray, " m"]:
-    """Divide distances from Λ into groups in geometric progression, and return the group of each distance.
+    """Divide distances into groups in geometric progression, and return the group of each distance.
 
-    If the largest distance is ρ times the least, each of s groups has a preconditioned matrix of condition ρ^(1/2s).
-    The number s minimises the cost of factorisations and of steps for all rows.
+    The distances are Λ − λᵢ. If the largest is ρ times the least, the preconditioned matrix of each of s groups has the
+    condition number ρ^(1/2s). The number s minimises the cost of factorisations and of steps for all rows.
     """
     ratio = max(distance.max() / distance.min(), 1 + 1e-12)
 
@@ -153,7 +152,7 @@ def group_numbers(
 
 
 def shifts_between(values: Values, nearest: Shifts, farthest: Shifts) -> Shifts:
-    """Return each group's shift, whose distance from Λ is the geometric mean of the group's extreme distances."""
+    """Return a shift for each group: its distance from Λ is the geometric mean of the group's extreme distances."""
     xp = values.__array_namespace__()
     targets, below = first_beyond(values) - xp.sqrt(nearest * farthest), -0.1 * values[-1]
     if values.size == 1:
@@ -186,8 +185,8 @@ def without_known(pencil: SymmetricPencil, vectors: Vectors) -> OfColumns:
     return lambda x: x - matmul(products_with_columns(vectors, mass(x)).T, vectors).T
 
 
-# Arrays as large as the eigenvectors are updated in place. To fill a new array of this size takes as long as products
-# with it, because the system must provide the memory.
+# Arrays as large as the eigenvectors are updated in place. Filling a new array of this size takes as long as a product
+# with it, because the operating system must provide memory.
 def projected(
     pencil: SymmetricPencil, vectors: Vectors, rhs: Rows, tolerance: float, amplified: OfRows
 ) -> tuple[Rows, OfRows]:

@@ -121,7 +121,7 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
     # `InteriorAdjoint` overrides the following methods.
 
     def _distance(self, p: int, k: int, row: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-        """Return the distances of the rows' eigenvalues from Λ, up to a factor, by Weyl's law in 2D."""
+        """Return the distances of the rows' eigenvalues from the next one, up to a factor, by Weyl's law in 2D."""
         return p + 1 - row
 
     def _shifts(self, pencil: Any, values: Values, groups: Groups) -> Shifts:
@@ -132,8 +132,8 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         return complement.amplification(values, k)
 
     # If r has a component along φⱼ by rounding, (K − λᵢM)(K − σM)⁻¹ multiplies it by (λⱼ − λᵢ)/(λⱼ − σ). This factor is
-    # large mainly for λⱼ near σ. So each step projects out only these φⱼ; the other φⱼ are projected out at the end or
-    # at a restart.
+    # large mainly for λⱼ near σ. So each step projects out only these φⱼ; the other φⱼ are projected out at restarts
+    # and at the end.
     def _solve_block(
         self, pencil: Any, values: Values, without_near: OfColumns, without_known: OfColumns, *of_block: Any
     ) -> Columns:
@@ -147,9 +147,9 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         return conjugate_gradients(product, precondition, b, wanted, clean=without_known).converged
 
 
-# On the complement, eigenvalues lie on both sides of the computed ones, so that K − λᵢM is indefinite. Let Λ₋ be the
-# last eigenvalue of the complement below the computed ones, and Λ₊ the first above. Let the shift σ, like λᵢ, lie
-# between Λ₋ and Λ₊. Then every λⱼ of the complement lies on the same side of σ and λᵢ, and
+# The eigenvalues of the complement lie on both sides of the computed eigenvalues, so that K − λᵢM is indefinite there.
+# Let Λ₋ be the last eigenvalue of the complement below the computed eigenvalues, and Λ₊ the first above them. Let the
+# shift σ, like λᵢ, lie between Λ₋ and Λ₊. Then every λⱼ of the complement is above both σ and λᵢ, or below both. So
 #
 #     A = (K − σM)⁻¹ (K − λᵢM)
 #
@@ -157,16 +157,16 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
 # gradients in this inner product solve A xᵢ = (K − σM)⁻¹ bᵢ. Products with A use the exact K − λᵢM. So an inaccurate
 # factorisation slows down convergence, but does not change the solution.
 #
-# Define the odds ω(λ) = (Λ₊ − λ)/(λ − Λ₋). The condition of A is at most the ratio of ω(λᵢ) and ω(σ); for example, if
-# λᵢ < σ, the eigenvalues of A lie between (λᵢ − Λ₋)/(σ − Λ₋) and (Λ₊ − λᵢ)/(Λ₊ − σ). The odds replace the distance from
-# Λ, to which they are proportional in the limit Λ₋ → −∞. Rows are grouped by their odds in geometric progression, and
-# the odds of a group's shift are the geometric mean.
+# Define the odds ω(λ) = (Λ₊ − λ)/(λ − Λ₋). The condition number of A is at most the ratio of ω(λᵢ) and ω(σ); for
+# example, if λᵢ < σ, the eigenvalues of A lie between (λᵢ − Λ₋)/(σ − Λ₋) and (Λ₊ − λᵢ)/(Λ₊ − σ). The odds replace the
+# distance Λ₊ − λ, to which they are proportional in the limit Λ₋ → −∞. Rows are grouped by their odds in geometric
+# progression, and the odds of a group's shift are the geometric mean.
 class InteriorAdjoint(FactorisedAdjoint):
     """Conjugate gradients in the inner product of M, with a factorisation of K − σM for each group of rows.
 
     The pairs are the k pairs of the rows, ascending from the origin of a `LocatedPencil`, followed by guard pairs on
-    either side in any order. Guards that do not exist are zero vectors with one of the computed eigenvalues. The error
-    is measured in the norm of M.
+    either side in any order. Missing guards are zero vectors with one of the computed eigenvalues. The error is
+    measured in the norm of M.
     """
 
     def _distance(self, p: int, k: int, row: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
@@ -197,11 +197,11 @@ class InteriorAdjoint(FactorisedAdjoint):
         def product(x: Columns) -> tuple[Columns, Float[Array, " b"]]:
             return factor.solve(stiffness(x) - shifts * mass(x)), complement.SINGULAR * inner(x, x)
 
-        # Rounding leaves components along computed eigenvectors. A amplifies only those whose eigenvalue is near σ.
+        # Rounding leaves components along computed eigenvectors. A amplifies only components with λⱼ near σ.
         right = factor.solve(b)
         return conjugate_gradients(product, without_near, right, wanted, inner, without_known).converged
 
 
 def _left(pencil: LocatedPencil, values: Values) -> tuple[Scalar, Scalar]:
-    """Estimate Λ₋ and Λ₊, the eigenvalues of the complement nearest to the computed ones."""
+    """Estimate Λ₋ and Λ₊, the eigenvalues of the complement nearest to the computed eigenvalues."""
     return jnp.min(values) - pencil.spacing, jnp.max(values) + pencil.spacing

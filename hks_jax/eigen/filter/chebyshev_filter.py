@@ -37,7 +37,7 @@ _SPARE = 0.35
 _LEAST_NODES = 6
 """The least number of nodes along each axis at which a grid is coarsened."""
 _LARGE = 1 << 21
-"""The total number of entries of the vectors above which progress is reported after each block, not only each round."""
+"""The total number of entries of the vectors above which every block reports progress, not only every round."""
 
 Pairs = tuple[Float[Array, " k"], Float[Array, "k n_dof"]]
 
@@ -48,15 +48,15 @@ class ChebyshevFilter(Eigensolver[Pencil]):
     The solver is for grids, mainly in 3D, where factorisations have much fill-in, and for accelerators. Filters run in
     single precision without loss of accuracy, because they act on residuals that are computed in the precision of the
     matrices. All pairs are computed simultaneously, so that multiple eigenvalues are complete; but no certificate shows
-    that none was missed. The solver works under `jit`. Outside `jit`, it can be interrupted and reports progress
-    between two rounds.
+    that no eigenvalue was missed. The solver works under `jit`. Outside `jit`, it can be interrupted and reports
+    progress between two rounds.
 
     Attributes:
         tolerance: the relative residual at which a pair counts as converged.
         block: the number of vectors filtered together. The workspace is proportional to this number.
         max_rounds: the maximal number of rounds on the finest grid.
         mesh: the devices, as a `jax.sharding.Mesh` with one axis. Each device filters some of the vectors, and stores
-            all vectors on a part of the grid (docs/devices.md). None is one device.
+            all vectors on a part of the grid (docs/devices.md). None means one device.
 
     Examples:
         >>> flat = hj.TensorField(hj.Grid((17, 17), 1 / 16), np.tile(np.eye(2), (17, 17, 1, 1)))
@@ -177,8 +177,8 @@ class Pace:
         if not self._factor > 1 or not self._excess > 1:
             return None
         rounds = math.ceil(math.log(self._excess) / math.log(self._factor))
-        # Later rounds filter fewer pairs. So if the work of this round is known, it is a better estimate than the work
-        # of the last round.
+        # Later rounds filter fewer pairs. So the work of this round, if known, is a better estimate than that of the
+        # last round.
         return (rounds - done / self._work) * self._seconds * self._work / self._last_work
 
 

@@ -46,7 +46,7 @@ def coarsen(fine: NodalPencil) -> NodalPencil:
 
     def coupled(images: Float[Array, "blocks b coarse"]) -> Stencil:
         # Basis functions of one colour have disjoint neighbourhoods. So at each node, the image of their sum is the
-        # entry that couples the node to the only near function.
+        # entry that couples the node to the only function nearby.
         entries = jnp.take_along_axis(images.reshape(padded, *shape), jnp.maximum(of_neighbour, 0), axis=0)
         return Stencil(jnp.where(of_neighbour >= 0, entries, 0), fine.periodic)
 
@@ -55,8 +55,7 @@ def coarsen(fine: NodalPencil) -> NodalPencil:
 
 
 def interpolate(fine: NodalPencil, x: Float[Array, "*coarse b"]) -> Float[Array, "*shape b"]:
-    """Interpolate multilinearly from every second node, and constantly beyond the last; set other than free nodes to
-    0."""
+    """Interpolate multilinearly from every second node, and constantly beyond the last; 0 except at free nodes."""
     every_second = (slice(None, None, 2),) * len(fine.shape)
     weights = _interpolate(fine.domain[every_second][..., None].astype(x.dtype), fine.shape, fine.periodic)
     x = _interpolate(jnp.where(fine.free[every_second][..., None], x, 0), fine.shape, fine.periodic)

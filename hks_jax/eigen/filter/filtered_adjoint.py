@@ -23,7 +23,7 @@ from hks_jax.fem.stencil import StencilOperator
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
 
 _GAIN = 20.0
-"""The polynomial's value at λ. A larger value takes more products with K, and a smaller value more projections."""
+"""The polynomial's value at λᵢ. A larger value takes more products with K; a smaller value takes more projections."""
 _MOST_DEGREE = 60
 _WIDEST = 0.9
 """The largest lower end of the polynomial's band, as a fraction of its upper end."""
@@ -61,12 +61,11 @@ class FilteredAdjoint(Adjoint[Pencil]):
         """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`."""
         space, nodal, high = pencil.space, nodal_pencil(pencil), prepared
         tolerance, beyond = complement.attainable(self.tolerance, rhs.dtype), complement.first_beyond(values)
-        # The polynomial acts on D⁻¹K, whose Rayleigh quotient for φ is φᵀKφ / φᵀDφ: on coarse grids, a fraction of λ.
+        # The polynomial acts on D⁻¹K, where D is the lumped mass. On coarse grids, φᵀKφ / φᵀDφ is only a fraction of λ.
         mass = space.restrict(nodal.lumped)
         quotients = values / jax.lax.map(lambda phi: jnp.sum(mass * phi * phi), vectors, batch_size=self.block)
         band = Band(jnp.minimum(jnp.max(quotients) * (1 + 1 / values.size), _WIDEST * high), high)
-        # At values nearer to the band, the polynomial would not reach its gain, and the preconditioner might not be
-        # definite.
+        # Nearer to the band, the polynomial would not reach its gain, and the preconditioner might be indefinite.
         nearest = (math.cosh(math.acosh(_GAIN) / _MOST_DEGREE) - 1) / 2
         quotients = jnp.minimum(quotients, band.low - nearest * (band.high - band.low))
         clean = complement.without_known(pencil, vectors)

@@ -19,7 +19,7 @@ MOST_DEGREE = 1000
 
 
 class Band(NamedTuple):
-    """The interval of eigenvalues of D⁻¹K that are damped, where D is the lumped mass."""
+    """The interval of eigenvalues of D⁻¹K that a polynomial damps, where D is the lumped mass."""
 
     low: Float[Array, ""]
     high: Float[Array, ""]
@@ -35,22 +35,22 @@ class Band(NamedTuple):
 
 
 # Let x be an approximate eigenvector with Rayleigh quotient λ and residual r = Kx − λMx. Let p be the Chebyshev
-# polynomial with |p| ≤ 1 on the band, which grows fast below it. Applying p(M⁻¹K)/p(λ) to x gives x plus a correction,
+# polynomial with |p| ≤ 1 on the band; p grows fast below the band. Then p(M⁻¹K)x/p(λ) is x plus a correction,
 #
 #     x + q(M⁻¹K) M⁻¹r,    q(z) = (p(z)/p(λ) − 1)/(z − λ),
 #
 # in which M⁻¹ acts only on the residual. So an approximate inverse, or single precision, does not change the limit
-# (residual-based filtering, R-ChFSI). If the lumped mass D replaces M, a mode of eigenvalue μ, for which D⁻¹M is the
-# factor β < 1, has z = βμ, and its coefficient in D⁻¹r is β(μ − λ) instead of z − λ. The two agree to second order in
+# (residual-based filtering, R-ChFSI). Let the lumped mass D replace M. For a mode of eigenvalue μ on which D⁻¹M is the
+# factor β < 1, z becomes βμ, and the coefficient in D⁻¹r is β(μ − λ) instead of z − λ. The two agree to second order in
 # h²λ if the lumped quotient ζ = xᵀKx / xᵀDx replaces λ and the correction is scaled by ζ/λ: for β(μ) ≈ 1 − ch²μ,
 #
 #     z − ζ = (μ − λ)(β − ch²λ + …) = β(μ − λ) · λ/ζ + ….
 #
 # If the mesh is coarse in one direction only, β also depends on the direction of a mode, and βμ and μ may order the
 # modes near the edge of the band differently. If the mesh is too coarse for the wanted modes, other modes with β ≈ 3⁻ᵈ
-# and much larger μ have smaller values βμ. Then W = Σⱼ (I − D⁻¹M)ʲ D⁻¹, with n more terms of the Neumann series,
-# replaces D⁻¹. Then βμ becomes ψ = (1 − (1 − β)ⁿ⁺¹)μ, at most n + 1 times as large. Since
-# dψ/dμ = 1 − (n + 2)(1 − β)ⁿ⁺¹, the scale ζ/λ becomes 1 − (n + 1)(1 − β)ⁿ⁺¹.
+# and much larger μ have smaller values βμ. In both cases, W = Σⱼ (I − D⁻¹M)ʲ D⁻¹ replaces D⁻¹, which adds n terms of
+# the Neumann series of M⁻¹. Then βμ becomes ψ = (1 − (1 − β)ⁿ⁺¹)μ, at most n + 1 times as large. Since dψ/dμ = 1 − (n +
+# 2)(1 − β)ⁿ⁺¹, the scale ζ/λ becomes 1 − (n + 1)(1 − β)ⁿ⁺¹.
 #
 # W may replace D⁻¹ everywhere. Since q < 0 on both sides of ζ, −q(D⁻¹K)D⁻¹ is also a symmetric positive definite
 # preconditioner for K − λM.
@@ -63,10 +63,10 @@ def correction(
     whole: Columns | float = 0.0,
     terms: Int[Array, ""] | int = 0,
 ) -> Columns:
-    """Return q(D⁻¹K) D⁻¹r for the residual r and the polynomial q of ζ = ``value``, at most the band's low end.
+    """Return q(D⁻¹K) D⁻¹r for the residual r and the polynomial q of ζ. Here ζ is ``value``, but at most ``band.low``.
 
     If n = ``terms`` > 0, W replaces D⁻¹, and value and band refer to WK. If a column x of ``whole`` is not zero, the
-    residual's column must be Kx; then D⁻¹Kx − ζx replaces D⁻¹r, which amounts to p(D⁻¹K)/p(ζ) applied to x.
+    residual's column must be Kx; then D⁻¹Kx − ζx replaces D⁻¹r, so that x plus the result is p(D⁻¹K)x / p(ζ).
     """
     dtype = residual.dtype
     stiffness, mass = (

@@ -22,15 +22,15 @@ from hks_jax.linear.accelerators import row_by_row
 from hks_jax.linear.loops import for_each
 
 _GAIN = 40.0
-"""The factor by which one round damps unwanted modes. With more, the error by the lumped mass dominates."""
+"""The factor by which one round damps unwanted modes. With a larger factor, the error by the lumped mass dominates."""
 _SPREAD = 1e5
-"""The largest growth of the lowest mode relative to the edge of the band. Beyond it, rounding errors dominate."""
+"""The largest growth of the lowest mode relative to the edge of the band. Beyond this limit, rounding dominates."""
 _LEAST_DEGREE = 4
 _MARGIN = 1.1
 """The safety factor of Weyl's law for the eigenvalue of the last vector."""
 _SPLIT, _APART = 0.02, 1.5
-"""The limits beyond which the inverse mass gets further terms: on the spread of the relative shifts of similar
-eigenvalues, and on the least ψ of modes above twice the last wanted eigenvalue, relative to that eigenvalue."""
+"""The inverse mass gets further terms until two conditions hold. The relative shifts of similar eigenvalues differ by
+at most ``_SPLIT``. Modes above twice the last wanted eigenvalue have ψ ≥ ``_APART`` times that eigenvalue."""
 _MOST_TERMS = 15
 """The maximal number of further terms of the Neumann series of the inverse mass."""
 
@@ -56,10 +56,10 @@ class FilterState(NamedTuple):
     """The state between two rounds."""
 
     values: Values  # Ritz values θ, ascending
-    vectors: Float[Array, "m nodes"]  # M-orthonormal Ritz vectors; several devices have one slab of padded nodes each
+    vectors: Float[Array, "m nodes"]  # M-orthonormal Ritz vectors; each of several devices has a slab of them
     residuals: Values  # ‖Kx − θMx‖/‖Mx‖
     lumped_values: Values  # xᵀKx / xᵀDx, where D is the lumped mass
-    terms: Number  # the number of further terms in the inverse mass
+    terms: Number  # the number of further terms of the Neumann series
     rounds: Number  # the number of rounds so far on this grid
 
 
@@ -67,9 +67,9 @@ class Filtering(NamedTuple):
     """The polynomials of a round."""
 
     band: Band  # the damped interval
-    terms: Number  # the number of further terms in the inverse mass
+    terms: Number  # the number of further terms of the Neumann series
     degrees: Int[Array, " blocks"]  # the degree for each block; 0 if all its vectors have converged
-    values: Values  # ψ of each vector, at which its polynomial is scaled to 1
+    values: Values  # the value ψ of each vector, at which its polynomial is 1
     factor: Values  # the factor by which each vector's correction is scaled
 
 
@@ -215,7 +215,7 @@ class GridFilter(eqx.Module):
 
 
 def _lumping(plan: Plan, state: FilterState) -> tuple[Number, Values, Values]:
-    """Return the number of further terms in the inverse mass, and each vector's ψ and scale with these terms."""
+    """Return the number of further terms in the inverse mass, and each vector's ψ and factor of correction."""
     values, wanted = state.values, state.values[plan.wanted - 1]
     # 1 − β of each mode: the relative decrease of its eigenvalue by the lumped mass.
     missing = 1 - jnp.where(values > 0, state.lumped_values / jnp.where(values > 0, values, 1), 1)

@@ -79,7 +79,7 @@ def rayleigh_ritz(pencil: NodalPencil, slabs: Slabs | None, block: int, x: Rows)
 
     def among_rows(number: Array) -> tuple[Array, ...]:
         images = products(block_of(x, number, block, pencil.shape))
-        # Images stay columns, because for rows XLA would compute stencils in that layout, seven times slower.
+        # Images stay columns. If they were rows, XLA would compute stencils in that layout, seven times as slowly.
         return tuple(matmul(x, image.reshape(nodes, block)) for image in images)
 
     both = jax.lax.map(among_rows, jnp.arange(m // block))
@@ -91,7 +91,7 @@ def rayleigh_ritz(pencil: NodalPencil, slabs: Slabs | None, block: int, x: Rows)
 
 
 def measured(pencil: NodalPencil, slabs: Slabs | None, block: int, values: Values, x: Rows) -> tuple[Values, Values]:
-    """Return ‖Kx − θMx‖/‖Mx‖ and the lumped quotient xᵀKx / xᵀDx of each row; see `rayleigh_ritz`."""
+    """Return ‖Kx − θMx‖/‖Mx‖ and xᵀKx / xᵀDx of each row x with value θ, where D is the lumped mass."""
     products = pencil.products()
 
     def of_block(number: Array) -> tuple[Array, ...]:

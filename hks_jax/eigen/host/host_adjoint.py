@@ -92,7 +92,7 @@ def _solve(
         return x
     distance = beyond - values[active]
     number = complement.group_numbers(distance, active.size, tolerance)
-    # Blocks are solved in parallel with one BLAS thread each: SuperLU's small BLAS calls gain nothing from more.
+    # Blocks are solved in parallel with one BLAS thread each; SuperLU's small BLAS calls gain nothing from threads.
     with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(os.cpu_count()) as threads:
         for group in np.unique(number):
             rows, own = active[number == group], distance[number == group]

@@ -30,16 +30,16 @@ _TOLD = 25
 
 
 class ShiftInvert(Eigensolver[Pencil]):
-    """ARPACK's Lanczos (`scipy.sparse.linalg.eigsh`) on (K + sM)⁻¹M, factorised by SuperLU, in float64 on the host.
+    """ARPACK's Lanczos (`scipy.sparse.linalg.eigsh`) on (K + sM)⁻¹M for some s > 0, by SuperLU in float64 on the host.
 
-    The inertia of a second factorisation checks that no eigenvalue below the last was missed. Under `jit` and `vmap`,
-    the solver runs in a host callback, one problem at a time. Outside `jit`, it can be interrupted, and reports
-    progress.
+    The inertia of a second factorisation checks that no eigenvalue was missed. Under `jit` and `vmap`, the solver runs
+    in a host callback, one problem at a time. Outside `jit`, it can be interrupted, and reports progress.
 
     Attributes:
         tolerance: the relative residual at which a pair counts as converged; ARPACK itself runs to machine precision.
         max_restarts: the maximal number of implicit restarts.
-        basis: the size of the Lanczos basis, more than k (for derivatives, more than 9 + k + k/20). None is 2k + 20.
+        basis: the size of the Lanczos basis; None means 2k + 20. The size is raised if it is not more than the number
+            of pairs, which for derivatives includes guard pairs.
 
     Examples:
         >>> sparse = hj.eigenpairs(field, k=12, solver=hj.ShiftInvert(basis=30))
@@ -70,8 +70,7 @@ class ShiftInvert(Eigensolver[Pencil]):
 
         def solve(volume: ArrayLike, *data: ArrayLike) -> tuple[np.ndarray, ...]:
             K, M = matrices(*data)
-            # Any s > 0 makes K + sM positive definite; here s is small relative to Weyl's λ₁ or to a typical
-            # eigenvalue.
+            # K + sM is positive definite for any s > 0; s is small relative to Weyl's λ₁ or a typical eigenvalue.
             if dimension is None or not np.isfinite(volume):
                 shift = 1e-3 * float(np.median(K.diagonal() / M.diagonal()))
             else:
@@ -127,8 +126,8 @@ class ShiftInvert(Eigensolver[Pencil]):
             values = np.concatenate([values, further])[order]
             vectors = np.concatenate([vectors, others], axis=1)[:, order]
             # Lanczos with single vectors can miss pairs of a multiple eigenvalue. By Sylvester's law of inertia, the
-            # negative pivots of K − σM count the eigenvalues below σ. If pairs are missing, search again, orthogonally
-            # to the others.
+            # negative pivots of K − σM count the eigenvalues below σ. If pairs are missing, search orthogonally to
+            # known pairs.
             below = values[-1] - 1e-6 * max(values[-1], shift)
             if below <= 0:  # only null vectors
                 return _padded(values, vectors, k, max(below, 0.0))

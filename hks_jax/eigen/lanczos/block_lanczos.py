@@ -24,7 +24,7 @@ from hks_jax.linear.pencil import SymmetricPencil, tabulated
 from hks_jax.traced import is_traced
 
 SLICE = 170
-"""The number of eigenvalues per slice. Smaller slices take more factorisations, larger ones more orthogonalisation."""
+"""The number of eigenvalues per slice. More slices take more factorisations, but less orthogonalisation."""
 _DENSE = 3000
 """The largest number of unknowns for which the dense solver takes over if slicing fails."""
 
@@ -39,7 +39,7 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
     Attributes:
         tolerance: the relative residual at which a pair counts as converged.
         block: the number of vectors per Lanczos block. Multiplicities may exceed this number.
-        slice_size: the number of eigenvalues per slice; None is automatic.
+        slice_size: the number of eigenvalues per slice; None means an automatic choice.
 
     Examples:
         >>> K = 2 * np.eye(59) - np.eye(59, k=1) - np.eye(59, k=-1)  # a string of 59 beads
@@ -95,7 +95,7 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
 
 
 def known_by_weyl(pencil: SymmetricPencil) -> bool:
-    """Return whether Weyl's law predicts where the spectrum begins and its density; otherwise inertia is needed."""
+    """Return whether Weyl's law predicts the beginning and density of the spectrum; otherwise inertia is needed."""
     return isinstance(pencil, Pencil) and pencil.measured and pencil.null_space is not None
 
 

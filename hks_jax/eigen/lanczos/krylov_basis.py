@@ -65,10 +65,10 @@ def write(basis: Basis, block: Block, row: Int[Array, ""]) -> Basis:
     return tuple(written)
 
 
-# One step of shift-invert Lanczos amplifies a block's component along a converged eigenvector 10 to 100 times. So two
-# steps amplify rounding errors until the components c = VᵀMx are 1e-14 to 1e-9. The sums c need double precision,
-# because their rounding errors would otherwise be as large as c. Single precision suffices to subtract Vc, with an
-# error of 6e-8 c. If c is large, because the shift is close to an eigenvalue, V is used in double precision.
+# One step of shift-invert Lanczos amplifies a block's component along a converged eigenvector 10 to 100 times. So after
+# two steps, a block x has components c = VᵀMx of 1e-14 to 1e-9 along the basis V, by rounding. The sums c need double
+# precision, because their rounding errors would otherwise be as large as c. Single precision suffices to subtract Vc,
+# with an error of 6e-8 c. If c is large, because the shift is close to an eigenvalue, V is used in double precision.
 def within(basis: Basis, images: Float[Array, "n_dof c"], filled: Int[Array, ""]) -> Float[Array, "n_dof c"]:
     """Return VVᵀMx, the projection of columns x on the first ``filled`` basis vectors V, given ``images`` = Mx."""
     if not isinstance(basis, tuple):
@@ -133,7 +133,7 @@ def _put(
 
 
 def recur(block: Block, image: Block, before: Block, coupling: Small, x: Block) -> tuple[Block, Small]:
-    """Orthogonalise x = (K − σM)⁻¹M · block against the block and the one before; also return blockᵀMx."""
+    """Orthogonalise x = (K − σM)⁻¹M · block against the block and the previous block; also return blockᵀMx."""
 
     def plain() -> tuple[Array, Array]:
         diagonal = gram(image, x)
@@ -159,8 +159,8 @@ def without(block: Block, image: Block, x: Block) -> Block:
 def orthonormal(mass: OfColumns, x: Block) -> tuple[Block, Block, Small]:
     """Return M-orthonormal columns y, My, and the factor R of x = yRᵀ.
 
-    XLA's operations factorise the Gram matrix by its eigenvalues; kernels use a pivoted Cholesky factorisation, which
-    is faster there. Both bound the divisors from below, so that no entry becomes infinite.
+    XLA's operations factorise the Gram matrix by its eigenvalues; CUDA kernels use a pivoted Cholesky factorisation,
+    which is faster on GPUs. Both methods bound the divisors from below, so that no entry becomes infinite.
     """
     identity = jnp.asarray(np.eye(x.shape[1], dtype=x.dtype))  # a constant, so that no kernel computes it
 
@@ -191,7 +191,7 @@ def _one_of(by_kernels: Callable[[], Any], plain: Callable[[], Any], x: Block) -
 
 
 def _factored(products: Small) -> tuple[Small, Small]:
-    """Return F with FFᵀ = G, where G is the Gram matrix, and F⁻ᵀ."""
+    """Return F and F⁻ᵀ, where FFᵀ = G is the Gram matrix."""
     norms = jnp.sqrt(jnp.diagonal(products))
     norms = jnp.where(norms > 0, norms, 1)
     sizes, mix = lapack.eigh(products / norms[None] / norms[:, None])

@@ -30,7 +30,7 @@ class ShiftedSolve(NamedTuple):
 
     factor: Factorisation  # the factorisation of K − σM
     shift: Float[Array, ""]  # σ
-    passes: Int[Array, ""] | None  # the number of solves, 1 or 2; if None, 1 without compiling the second
+    passes: Int[Array, ""] | None  # the number of solves, 1 or 2; None is 1, without compiling the second
 
 
 class _Recurrence(NamedTuple):
@@ -41,7 +41,7 @@ class _Recurrence(NamedTuple):
     block: Block  # the following block
     image: Block  # the image of this block under M
     coupling: Small  # the coupling of the two blocks
-    # the diagonal and subdiagonal blocks of the block tridiagonal matrix VᵀM(K − σM)⁻¹MV
+    # the diagonal and subdiagonal blocks of the block tridiagonal matrix VᵀM(K − σM)⁻¹MV, where V has the blocks so far
     matrix: Float[Array, "steps two b b"]
 
 
@@ -57,12 +57,11 @@ def block_lanczos(
     """Run block Lanczos on (K − σM)⁻¹M, orthogonal to known eigenvectors.
 
     The recurrence keeps consecutive blocks orthogonal. In double precision, only every second step orthogonalises
-    against the whole basis, but two blocks at once. Thus the basis is read half as often, and stays M-orthonormal to
-    rounding.
+    against the whole basis, but then for two blocks at once. Thus the basis is read half as often, and stays
+    M-orthonormal to rounding.
     """
     state, traced = _begin(pencil, start, known, room), is_traced(shifted)
-    # Under `jit`, the loop takes `room` steps: if the number of steps varied within a batch, every iteration would copy
-    # the whole state.
+    # Under `jit`, the loop takes `room` steps. If the number varied in a batch, each iteration would copy the state.
     steps = room if traced else int(steps)
     if not traced and shifted.passes is not None and int(shifted.passes) == 1:
         shifted = shifted._replace(passes=None)
@@ -98,9 +97,9 @@ def _advance(
     last: int | Array,
 ) -> _Recurrence:
     """Take the steps first to last − 1, or two steps if ``alone``. The blocks begin at row ``offset`` of the basis."""
-    # If an eigenvalue is close to the shift, its θ may be 1000 times as large as other θ. A step amplifies the rounding
-    # error along this eigenvector 1000 times. So in single precision, every step orthogonalises against the whole
-    # basis.
+    # If an eigenvalue is close to the shift, its Ritz value θ may be 1000 times as large as the others. A step
+    # amplifies the rounding error along this eigenvector 1000 times. So in float32, every step orthogonalises against
+    # the whole basis.
     every = 2 if state.block.dtype == jnp.float64 else 1
     two = accelerators.at_hand()
 

@@ -1,10 +1,10 @@
-"""Spectrum slicing: the lowest eigenpairs of a pencil, slice by slice, with a certificate that none is missed.
+"""Spectrum slicing: the lowest eigenpairs of a pencil, slice by slice, with a certificate that no pair is missed.
 
 Each slice factorises K − σM at a shift σ slightly above the known eigenvalues. The inertia gives the number of
-eigenvalues below σ. Block Lanczos finds the eigenvectors below σ that are not known yet, and about as many above σ.
-Its basis is kept orthogonal to the known eigenvectors close to σ. Converged pairs become known. A last factorisation,
-at a shift above the wanted eigenvalues, is the certificate: its inertia equals the number of known eigenvalues below
-the shift. Small slices keep orthogonalisation cheap for any number of wanted pairs.
+eigenvalues below σ. Block Lanczos finds the eigenvectors below σ that are not known yet, and about as many above σ. The
+Lanczos basis is kept orthogonal to the known eigenvectors close to σ. Converged pairs become known. A last
+factorisation, at a shift above the wanted eigenvalues, is the certificate: its inertia equals the number of known
+eigenvalues below the shift. Small slices keep orthogonalisation cheap for any number of wanted pairs.
 """
 
 import jax
@@ -38,7 +38,7 @@ _COPY = 1e-6
 Scalar = Float[Array, ""]
 Interval = tuple[Scalar, Scalar]
 Order = Int[Array, " ritz"]
-"""The order in which Ritz vectors are stored; the accepted ones come first."""
+"""The order in which Ritz vectors are stored; accepted vectors come first."""
 
 
 def cut(
@@ -61,13 +61,12 @@ def _consider(
     complete = trial.sound & (missing == 0)
     last = jnp.sort(state.values)[plan.wanted - 1]
     all_wanted = (known >= plan.wanted) | (last * (1 - 2 * _COPY) < state.shift)  # or just below the last multiplet
-    finished = complete & (all_wanted | (negative == problem.pencil.size))  # or no more exist
+    finished = complete & (all_wanted | (negative == problem.pencil.size))  # or no further eigenvalues exist
     # If equally many eigenvalues are missing at a lower shift, the missing eigenvalues are equal. Then search at this
     # shift, repeatedly if necessary.
     too_many = trial.sound & (missing > plan.slice_size) & (below != state.below)
     multiple = trial.sound & (missing > 2 * plan.block) & (below == state.far_below)
-    # If a multiplicity exceeds the wanted number, some of its pairs suffice; the certificate then ends below the
-    # multiplet.
+    # If a multiplicity exceeds the wanted number, some pairs suffice. Then the certificate ends below the multiplet.
     cut = multiple & jnp.isfinite(last)
     lowest = jnp.where(state.reached > 0, state.reached, problem.lowest)
     accurate = state.stuck | (trial.error <= _ERROR * _needed(problem, plan, lowest))
@@ -132,7 +131,7 @@ def search(
 def _nearest(
     problem: Problem, shifted: ShiftedSolve, plan: Plan, state: SlicingState, vectors: Stored
 ) -> tuple[Order, Float[Array, "ritz n_dof"], SlicingState]:
-    """Search by inverse iteration, orthogonal to all known eigenvectors; see `_accept`. Only for concrete values."""
+    """Search by inverse iteration, orthogonal to all known eigenvectors; see `_accept`. Values must be concrete."""
     missing = int(state.below - jnp.sum(state.values < state.shift))
     count = min(missing + plan.block, plan.ritz, problem.pencil.size - int(state.known))
     x = jax.random.normal(jax.random.key(int(state.slices)), (problem.pencil.size, count), state.shift.dtype)
@@ -231,9 +230,9 @@ def _accept(
     # All eigenvalues between the shift and `end` are known.
     gapless = jnp.max(jnp.where((index < known) & (all_values < end), all_values, -jnp.inf), initial=0)
 
-    # If eigenvalues below the shift are missing, move to the lowest Ritz value that did not converge. If all converged,
-    # a multiplet was found only in part, and its eigenvalue is unknown. If not even the lowest pairs converge, move
-    # below the spectrum, where the matrix is definite and its factorisation most accurate.
+    # If eigenvalues below the shift are missing, move towards the lowest Ritz value that did not converge. If all these
+    # Ritz values converged, a multiplet was found only in part, and its eigenvalue is unknown. If not even the lowest
+    # pairs converge, move below the spectrum, where the matrix is definite and its factorisation most accurate.
     lowest = jnp.min(jnp.where(~converged & (values > low) & (values < shift), values, shift))
     seen, stuck = lowest < shift, ~complete & (count == 0)
     again = jnp.where(seen, lowest + (shift - lowest) / 4, (state.complete_below + shift) / 2)

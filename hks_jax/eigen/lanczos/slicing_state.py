@@ -127,7 +127,7 @@ def crowded(plan: Plan, state: SlicingState) -> Bool[Array, ""]:
 
 @jit_quickly(static_argnames="plan", donate_argnames="vectors")
 def make_room(plan: Plan, state: SlicingState, vectors: Stored) -> tuple[SlicingState, Stored]:
-    """Discard the highest known pairs, more than are wanted; if stuck, discard all pairs above ``reached``."""
+    """Discard the highest known pairs to make room for a search; if stuck, discard all pairs above ``reached``."""
     order = jnp.argsort(state.values)
     count = jnp.where(state.stuck, jnp.sum(state.values <= state.reached), state.known)
     count = jnp.minimum(count, plan.capacity - plan.ritz)
