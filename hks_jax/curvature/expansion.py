@@ -49,9 +49,8 @@ def hks_expansion(
 
         u₁ = R/6,   u₂ = (R² + 2|Ric|² + 4∇²R)/120.
 
-    McKean and Singer (1967) give u₂ = (5R² − 2|Ric|² + 2|Riem|² + 12∇²R)/360; in three dimensions, the curvature tensor
-    Riem has |Riem|² = 4|Ric|² − R². The expansion ignores the boundary, and so holds at distances from the boundary
-    well above 3√t.
+    McKean and Singer (1967) give u₂ = (5R² − 2|Ric|² + 2|Riem|² + 12∇²R)/360; in 3D, the curvature tensor Riem has
+    |Riem|² = 4|Ric|² − R². The expansion ignores the boundary, and so holds at distances well above 3√t from it.
 
     If the field was made from a function, JAX differentiates it, and the coefficients are exact. Otherwise the
     coefficients come from finite differences of sixth order, which are one-sided near the sides of a grid and the rim
@@ -63,7 +62,8 @@ def hks_expansion(
     Args:
         field: the metric, d = 2 or 3.
         times: (n_times,) positive times, in length².
-        order: the highest power of t in the brackets: 0 … 3 on a surface, 0 … 2 in three dimensions; None is 3 or 2.
+        order: the highest power of t in the brackets, at most 3 on a surface and 2 in three dimensions; None is the
+            maximum.
         periodic: whether the axes are periodic; one value for all axes, or one per axis.
 
     Raises:

@@ -52,8 +52,7 @@ def gaussian_curvature(field: TensorField, periodic: bool | Sequence[bool] = Fal
 
     If the field was made from a function, JAX differentiates it, and K is exact. Otherwise K comes from sixth-order
     finite differences of the nodal tensors. The differences are one-sided near the edges of the grid and the mask. K is
-    NaN outside the mask, and where no stencil fits into the mask. A stencil has 7 nodes in a row; second derivatives
-    near an edge take 8.
+    NaN outside the mask and where no stencil fits into it. A stencil is a row of 7 nodes, or 8 near an edge.
 
     Args:
         periodic: whether the axes are periodic, so that node n is node 0; one value for all axes, or one per axis.

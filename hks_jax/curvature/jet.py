@@ -182,7 +182,7 @@ def at_nodes(fn: Callable[[Array], Any], grid: Grid, inside: Bool[np.ndarray, "*
     would enter the gradients even if NaN were masked afterwards.
     """
     flat = np.where(inside[..., None], grid.nodes, grid.nodes[inside][0]).reshape(-1, grid.dimension)
-    # High derivatives have many intermediates per node. Batches limit their memory and keep them in the cache.
+    # High derivatives have many intermediates per node; batches limit their memory and keep them in the cache.
     n_batches = -(-grid.size // _BATCH)
     batches = np.resize(flat, (n_batches, -(-grid.size // n_batches), grid.dimension))
     values = jax.lax.map(jax.vmap(fn), jnp.asarray(batches, jnp.result_type(float)))

@@ -1,9 +1,8 @@
 """Truncated Taylor series in two variables.
 
 A series is the vector of its coefficients in the order 1, x, y, x², xy, y², …, by total degree. So a shorter vector is
-a truncation of the series, and an operation on several series returns as many terms as the shortest one has. Nested JAX
-derivatives would compute each mixed derivative for every order of the variables, and take several times as long to
-compile and run.
+a truncation of the series, and operations on several series truncate all of them to the shortest one. Nested JAX
+derivatives would compute each mixed derivative for every order of the variables, and take several times as long.
 """
 
 from collections.abc import Callable

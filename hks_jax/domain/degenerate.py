@@ -27,14 +27,12 @@ class DegeneratePoints(NamedTuple):
 def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
     """Find the points of a 2D field where the two eigenvalues are equal, and the topological index of each.
 
-    If T is the tensor, the vector (T₁₁ − T₂₂, 2T₁₂) vanishes at these points. This vector turns twice as fast as the
-    eigenvectors, and is interpolated bilinearly. A cell around which the vector turns contains one zero, of index ½
-    (wedge) or −½ (trisector). Close zeros are merged into one point with the sum of their indices (Tricoche,
-    Scheuermann and Hagen 2001).
+    For the tensor T, the vector (T₁₁ − T₂₂, 2T₁₂) vanishes at these points. This vector is interpolated bilinearly, and
+    turns twice as fast as the eigenvectors. A cell around which the vector turns has one zero, of index ½ (wedge) or −½
+    (trisector). Close zeros are merged into one point with the sum of their indices (Tricoche and others 2001).
 
     Points of index 0, pairs of opposite index that are closer than `merge`, and points on the rim of the domain are not
-    found. If eigenvalues are equal on a curve or in a region off the rim, the centre of this set is found unless its
-    index is 0.
+    found. If eigenvalues are equal on a curve or in a region off the rim, the centre is found unless the index is 0.
 
     Args:
         field: a 2D field. Cells with a node outside the mask are not part of the domain.

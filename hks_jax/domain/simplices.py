@@ -174,7 +174,7 @@ def _check_once(faces: Int[np.ndarray, "F 3"]) -> None:
 
 
 def _warn_of_hanging(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulation) -> None:
-    """Warn if boundary edges pass through a vertex. The surface is torn there, as one side has more vertices."""
+    """Warn if boundary edges pass through a vertex. There the surface is torn, as its two sides differ in vertices."""
     edges = triangulation.facet_vertices(triangulation.boundary_facets)
     rim = np.unique(edges)
     if not rim.size:

@@ -87,7 +87,7 @@ class TensorField(eqx.Module):
     def _checked(
         cls, grid: Grid, interpolation: Interpolation, tensors: Any = None, function: Any = None
     ) -> "TensorField":
-        """Return a field of tensors, or of a function, that were checked before."""
+        """Return a field without another check of its tensors or of its function's values."""
         field, interpolation = cls.__new__(cls), checked_interpolation(interpolation)
         values = {"grid": grid, "interpolation": interpolation, "function": function, "_tensors": tensors}
         for name, value in values.items():

@@ -191,11 +191,11 @@ class Multifrontal(lx.AbstractLinearSolver[_State]):
         return unflatten(state.solve(flat)), lx.RESULTS.successful, {}
 
     def transpose(self, state: _State, options: dict[str, Any]) -> tuple[_State, dict[str, Any]]:
-        """Return the state of the transpose."""
+        """Return the state of the transposed operator."""
         return (state.conjugated() if state.hermitian else state), options
 
     def conj(self, state: _State, options: dict[str, Any]) -> tuple[_State, dict[str, Any]]:
-        """Return the state of the conjugate."""
+        """Return the state of the conjugate operator."""
         return state.conjugated(), options
 
     def assume_full_rank(self) -> bool:

@@ -42,8 +42,7 @@ Form = Callable[[ShapeFunction, ShapeFunction, Point], Array]
 
 
 def laplace_beltrami(u: ShapeFunction, v: ShapeFunction, w: Point) -> Array:
-    """Return the integrand ρ (T⁻¹∇u·∇v + V u v) of the stiffness; without a potential V = 0, without a density ρ =
-    1."""
+    """Return the stiffness's integrand ρ (T⁻¹∇u·∇v + V u v); without a potential V = 0, without a density ρ = 1."""
     energy = u.grad @ w.inverse @ v.grad
     if "potential" in w.fields:
         energy = energy + w["potential"] * u.value * v.value

@@ -35,10 +35,8 @@ def neighbours(x: Any, dimension: int) -> Iterator[Any]:
 
 
 def side_by_side(coefficients: Float[Array, "offsets *shape"]) -> Float[Array, " entries"]:
-    """Return the coefficients in one row, node by node, which halves the time of a product.
-
-    For a result with several axes, XLA could choose another order in memory.
-    """
+    """Return the coefficients in one row, node by node, which halves the time of a product."""
+    # For a result with several axes, XLA could choose another order in memory.
     return jnp.moveaxis(coefficients, 0, -1).reshape(-1)
 
 

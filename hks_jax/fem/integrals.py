@@ -26,7 +26,7 @@ from hks_jax.fem.space import GridSpace, MeshSpace, cells_of, couplings_for, mas
 from hks_jax.fem.stencil import StencilOperator
 
 _ON_HOST = 1 << 17
-"""The largest number of tensor entries for which NumPy integrates, in milliseconds and without compilation."""
+"""NumPy integrates up to this number of tensor entries, which takes milliseconds and no compilation."""
 
 
 def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace, operator: WeakForm) -> Pencil:
@@ -278,7 +278,7 @@ def assemble_mesh(
     lumped = volumes = row_sums_of(own, mass)
     if "density" in fields:
         volumes = jnp.sqrt(spd.determinant(metric)) @ element.weights.astype(metric.dtype)
-    # The error of P1 elements is estimated from the lengths of edges. No such estimate is known for P2.
+    # The error of P1 elements is estimated from the lengths of edges. No error estimate is known for P2 elements.
     sampled = SampledMetric(jax.lax.stop_gradient(mesh.metric), None) if space.degree == 1 else None
     return assembled(
         gathered(own, stiffness), gathered(own, mass), lumped, sampled, jnp.sum(volumes), own, operator, fields

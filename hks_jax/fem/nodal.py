@@ -81,7 +81,7 @@ class NodalPencil(eqx.Module):
 
 
 def lump(stiffness: Stencil, mass: Stencil, free: Bool[Array, "*shape"], domain: Bool[Array, "*shape"]) -> NodalPencil:
-    """Return the nodal pencil of a stiffness and a mass; it also contains the row sums of the mass."""
+    """Return the `NodalPencil` of a stiffness and a mass; the row sums of the mass are computed."""
     sums = jnp.where(free, jnp.sum(mass.coefficients, axis=0), 1)
     return NodalPencil(stiffness, mass, jax.lax.stop_gradient(sums), free, domain)
 
@@ -152,10 +152,9 @@ def _of_one(pencil: Pencil) -> Pencil:
 
 
 # The largest Kᵢᵢ/Mᵢᵢ is a Rayleigh quotient and so at most the largest eigenvalue: the spectrum does not become wider.
-# The quotient exceeds the lowest quarter of the spectrum. On a uniform grid with the consistent mass, the quotient is
-# 6/h² in 2D and 9/h² in 3D, and the quarter ends at 3.8/h² and 7.6/h². With a lumped mass the quotient is 2.7/h², and
-# the quarter ends at 2.2/h² and 2.4/h². Because this margin is small, the quotient is doubled; the spectrum then ends
-# at 5.3/h² instead of 4/h².
+# The quotient exceeds the lowest quarter of the spectrum. On a uniform grid with consistent mass, it is 6/h² in 2D and
+# 9/h² in 3D, and the quarter ends at 3.8/h² and 7.6/h². For lumped mass it is 2.7/h², and the quarter ends at 2.2/h²
+# and 2.4/h². Because this margin is small, the quotient is doubled; the spectrum then ends at 5.3/h², not 4/h².
 @jax.jit
 def _with_others(
     stiffness: Float[Array, "offsets *shape"], mass: Float[Array, "m *shape"], free: Bool[np.ndarray | Array, "*shape"]

@@ -70,13 +70,13 @@ class Pencil(SymmetricPencil):
         return functions if self.row_sums is None else _read(self.mass, self.row_sums, functions)
 
     def integrals(self, values: Float[Array, "... n_dof"]) -> Float[Array, "... n_dof"]:
-        """Return weights w with ∫φu = w·φ for all φ whose nodal values come from `read`; u has the nodal ``values``."""
+        """Return weights w with w·φ = ∫φu, where φ are nodal values from `read`, and u has the nodal ``values``."""
         if self.row_sums is None:
             return self.mass.apply(values)
         return jnp.where(jnp.isinf(self.row_sums), 0, self.row_sums) * values
 
     def with_stiffness(self, stiffness: PatternedOperator) -> "Pencil":
-        """Return the pencil with another stiffness on the same domain, such as K + V; its null space is not known.
+        """Return the pencil with another stiffness, such as K + V, on the same domain; the null space is then unknown.
 
         ``pencil.with_stiffness(pencil.stiffness.plus(V))`` with V (n_dof,) adds a diagonal matrix.
 
@@ -141,7 +141,8 @@ class MirrorPencil(eqx.Module):
 
     def read(self, functions: Float[Array, "k n_dof"], part: Int[Array, " k"] | None) -> Float[Array, "k n_dof"]:
         """Return the values of functions at the free nodes, given their unknowns and each function's part."""
-        # At the free nodes of a part, its mass equals the mass of the first part; at other nodes its functions vanish.
+        # At the free nodes of a part, its mass equals the first part's mass; at other nodes the part's functions
+        # vanish.
         sums = [
             jnp.where(part.space.free, part.space.extend(part.row_sums, outside=0.0), jnp.inf)
             for part in self.parts

@@ -77,9 +77,9 @@ def _dispersion(xp: Any, tensors: Any, spacing: Any, lumped: bool, cancelling: b
 
 # Between neighbours along axis a, the flux matrix A = √|T| T⁻¹ changes by δA, and an element uses the mean of A. Let eₐ
 # be the unit vector along axis a. The exact solution u = p·x + w has a corrector w with ∂ₐ(Aₐₐ∂ₐw) = −(∂ₐA eₐ)·p. The
-# energy of an element lacks the energy of the corrector, Aₐₐ(∂ₐ²w)² hₐ²/12. If p has the covariance A⁻¹, the lacking
-# energy is δAeₐ·A⁻¹δAeₐ/12Aₐₐ, relative to the energy of p along one axis. The estimate holds for √t above the length
-# on which A varies; for smaller t only its order of magnitude is right.
+# energy of an element does not include the energy of the corrector, Aₐₐ(∂ₐ²w)² hₐ²/12. If p has the covariance A⁻¹, the
+# missing energy is δAeₐ·A⁻¹δAeₐ/12Aₐₐ, relative to the energy of p along one axis. The estimate holds for √t above the
+# length on which A varies; for smaller t only its order of magnitude is right.
 def _turning(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...]) -> Any:
     """Return the relative error (*shape) of eigenvalues due to the variation of tensors between neighbours."""
     root = xp.sqrt(spd.determinant(tensors))[..., None, None]
@@ -150,8 +150,7 @@ _BIAS = (0.03, 0.22)
 """The constant c in the relative bias c·h²/t of P1 elements, for consistent and lumped mass; h is the longest edge.
 
 On regular and perturbed meshes of squares, spheres, boxes and balls, the median of c over the nodes was 0.008 … 0.028
-for consistent and 0.03 … 0.14 for lumped mass.
-"""
+for consistent and 0.03 … 0.14 for lumped mass."""
 
 
 @jit_quickly(static_argnames=("n_vertices", "lumped"))

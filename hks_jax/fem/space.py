@@ -238,8 +238,7 @@ def axis_colours(n: int, spacing: int, wraps: bool) -> Int[np.ndarray, " n"]:
     """Return the colours of the nodes along one axis; nodes of the same colour are at least ``spacing`` nodes apart."""
     if not wraps:
         return np.arange(n) % min(spacing, n)
-    # The axis is split into as many runs of at least `spacing` nodes as fit. The colour of a node is its place in the
-    # run.
+    # The axis is split into as many runs of at least `spacing` nodes as fit. A node's colour is its place in the run.
     runs = max(n // spacing, 1)
     return np.concatenate([np.arange(len(run)) for run in np.array_split(np.arange(n), runs)])
 

@@ -136,10 +136,7 @@ def _checked_null_vectors(pencil: SymmetricPencil, null_vectors: Any) -> Float[A
 
 
 def require_null_space(pencil: SymmetricPencil) -> None:
-    """Raise ValueError if the stiffness does not annihilate the null space of its pencil.
-
-    Traced values are not checked.
-    """
+    """Raise ValueError unless the stiffness annihilates the pencil's null space; traced values are not checked."""
     if pencil.null_space is None or is_traced(pencil) or not pencil.n_null:
         return
     # The check uses NumPy, which needs no compilation.

@@ -22,7 +22,7 @@ from hks_jax.linear.pattern import Pattern
 from hks_jax.linear.products import of_each_row
 
 _CELL = {2: 25, 3: 64}
-"""The largest part, in nodes, that is not bisected. Smaller parts need fewer operations, but more batches."""
+"""The largest number of nodes of a part that is not bisected. Smaller parts need fewer operations, but more batches."""
 
 
 @jax.tree_util.register_static
@@ -42,8 +42,7 @@ class GridPattern(ByKey, Pattern):
         return 3**self.space.dimension // 2 * self.space.free.size + np.flatnonzero(self.space.free)
 
     def bisect(self) -> Parts:
-        """Bisect recursively: one or two lines of nodes (a plane in 3D) cut the longest side of a part at its
-        median."""
+        """Cut parts recursively at the median of their longest side, by one or two lines of nodes (in 3D, a plane)."""
         x = np.stack(np.nonzero(self.space.free)).astype(np.int32)
         d, n = x.shape
         level, part, left, q = np.zeros(n, np.int8), np.zeros(n, int), np.arange(n), np.zeros(n, int)
@@ -186,10 +185,7 @@ def coefficients_of(operator: Operator, space: GridSpace) -> Float[Array, "offse
 
 
 class StencilOperator(PatternedOperator):
-    """A stencil on the free nodes of a grid, with 9 coefficients per node in 2D and 27 in 3D.
-
-    The coefficients are those of a `Stencil`. Couplings to nodes that are not free are zero.
-    """
+    """A stencil on the free nodes of a grid; couplings to nodes that are not free are zero."""
 
     coefficients: Float[Array, "offsets *shape"]
     space: GridSpace = eqx.field(static=True)
