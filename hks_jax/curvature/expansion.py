@@ -49,20 +49,21 @@ def hks_expansion(
 
         u₁ = R/6,   u₂ = (R² + 2|Ric|² + 4∇²R)/120.
 
-    These are the coefficients of McKean and Singer (1967), u₂ = (5R² − 2|Ric|² + 2|Riem|² + 12∇²R)/360, with |Riem|² =
-    4|Ric|² − R². The expansion ignores the boundary, and holds at distances well above 3√t from it.
+    McKean and Singer (1967) give u₂ = (5R² − 2|Ric|² + 2|Riem|² + 12∇²R)/360; in 3D, the curvature tensor Riem has
+    |Riem|² = 4|Ric|² − R². The expansion ignores the boundary, and so holds at distances well above 3√t from it.
 
-    If the field was made from a function, the coefficients are exact, from JAX derivatives. Otherwise the coefficients
-    come from finite differences of sixth order, which are one-sided near the sides of a grid and the rim of a mask.
-    Near sides and rims, u₂ is of fourth order and u₃ of second order in the spacing h, measured as a length. For the
-    machine precision ε, the relative rounding error of u₃ is about ε(t/h²)³/5, and a hundred times larger within eight
-    nodes of a side or rim. In float32 keep t below 30 h², or the order below 3. The result is NaN outside the mask, and
-    where no stencil fits into the mask.
+    If the field was made from a function, JAX differentiates it, and the coefficients are exact. Otherwise the
+    coefficients come from finite differences of sixth order, which are one-sided near the sides of a grid and the rim
+    of a mask. Near sides and rims, the error of u₂ is of fourth order and the error of u₃ is of second order in the
+    node distance h. For the machine precision ε, the relative rounding error of u₃ is about ε(t/h²)³/5, and a hundred
+    times larger within eight nodes of a side or rim. In float32 keep t below 30 h², or the order below 3. The result is
+    NaN outside the mask, and where no stencil fits into the mask.
 
     Args:
         field: the metric, d = 2 or 3.
         times: (n_times,) positive times, in length².
-        order: the highest power of t in brackets, 0 … 3 on a surface, 0 … 2 in three dimensions; None is the highest.
+        order: the highest power of t in the brackets, at most 3 on a surface and 2 in three dimensions; None is the
+            maximum.
         periodic: whether the axes are periodic; one value for all axes, or one per axis.
 
     Raises:
@@ -101,7 +102,7 @@ def _hks_expansion(
 
 
 def _of_surface(K: Array, laplacian_K: Any = 0, gradient_squared: Any = 0, bilaplacian_K: Any = 0) -> Coefficients:
-    """Return 1, u₁, u₂ and u₃; a coefficient is right only if all of its invariants are given."""
+    """Return 1, u₁, u₂ and u₃. A coefficient is wrong if an invariant in its formula is left out."""
     return [
         jnp.ones_like(K),
         K / 3,
@@ -111,7 +112,7 @@ def _of_surface(K: Array, laplacian_K: Any = 0, gradient_squared: Any = 0, bilap
 
 
 def _of_volume(metric: Jet, curvature: Jet | None) -> Coefficients:
-    """Return 1, u₁ and, if the jet of R is given, u₂."""
+    """Return 1, u₁ and, if the jet of the scalar curvature is given, u₂."""
     R, ricci_squared = scalar_and_ricci_squared(metric)
     coefficients = [jnp.ones_like(R), R / 6]
     if curvature is not None:
@@ -120,7 +121,7 @@ def _of_volume(metric: Jet, curvature: Jet | None) -> Coefficients:
 
 
 def _exact(field: TensorField, order: int, wraps: tuple[bool, ...]) -> tuple[Coefficients, Bool[np.ndarray, "*shape"]]:
-    """Return the coefficients up to the order from the metric's function, and the nodes of the domain."""
+    """Compute the coefficients up to the order from the metric's function; also return the nodes of the domain."""
     metric, inside = metric_function(field), domain_nodes(field.grid, wraps)
 
     def of_surface(x: Array) -> Coefficients:
@@ -136,12 +137,12 @@ def _exact(field: TensorField, order: int, wraps: tuple[bool, ...]) -> tuple[Coe
 
 
 def _invariant_series(E: taylor.Series, F: taylor.Series, G: taylor.Series, order: int) -> tuple[taylor.Series, ...]:
-    """Return Taylor series of K and, if the order needs them, ∇²K, |∇K|² and ∇⁴K of the metric ((E, F), (F, G))."""
+    """Return Taylor series of K and, if the order needs them, ∇²K, |∇K|² and ∇⁴K, for the metric ((E, F), (F, G))."""
     add, times, d = taylor.add, taylor.product, taylor.derivative
     determinant = add(times(E, G), -times(F, F))
     over = taylor.reciprocal(determinant)
 
-    def raised(p: Pair) -> Pair:  # the vector times |g|, by the adjugate
+    def raised(p: Pair) -> Pair:  # |g| times the vector of the covector p, by the adjugate of g
         return add(times(G, p[0]), -times(F, p[1])), add(times(E, p[1]), -times(F, p[0]))
 
     def inner(p: Pair, q: Pair) -> taylor.Series:
@@ -152,7 +153,7 @@ def _invariant_series(E: taylor.Series, F: taylor.Series, G: taylor.Series, orde
         return d(f, 0), d(f, 1)
 
     def laplacian(f: taylor.Series) -> taylor.Series:
-        # (1/√|g|) ∂ₐ(vᵃ/√|g|), expanded so that no square roots remain.
+        # For the vector v = |g| ∇f, ∇²f = (1/√|g|) ∂ₐ(vᵃ/√|g|) is expanded so that no square roots remain.
         v, slope = raised(gradient(f)), gradient(determinant)
         along = times(over, add(times(v[0], slope[0]), times(v[1], slope[1])))
         return times(over, add(d(v[0], 0), d(v[1], 1), -along / 2))
@@ -168,7 +169,7 @@ def _invariant_series(E: taylor.Series, F: taylor.Series, G: taylor.Series, orde
 
 
 def _nodal(field: TensorField, order: int, wraps: tuple[bool, ...]) -> tuple[Coefficients, Bool[np.ndarray, "*shape"]]:
-    """Return the coefficients by nested differences, and the nodes where all of them are known."""
+    """Compute the coefficients by nested finite differences; also return the nodes where all coefficients are known."""
     g, known = metric_jet(field, wraps)
     if field.grid.dimension == 3:
         R = None

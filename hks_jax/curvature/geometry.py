@@ -29,8 +29,8 @@ from hks_jax.domain.tensor_field import TensorField
 def scalar_curvature(field: TensorField, periodic: bool | Sequence[bool] = False) -> Float[Array, "*shape"]:
     """Return the scalar curvature R of a metric at the nodes; on a surface R = 2K for the Gaussian curvature K.
 
-    If the field was made from a function, R is exact, from JAX derivatives. Otherwise R comes from finite differences
-    of sixth order of the nodal tensors, and is NaN as in `gaussian_curvature`.
+    If the field was made from a function, JAX differentiates it, and R is exact. Otherwise R comes from sixth-order
+    finite differences of the nodal tensors, and is NaN under the conditions that `gaussian_curvature` states.
 
     Args:
         field: the metric, d = 2 or 3.
@@ -50,12 +50,12 @@ def scalar_curvature(field: TensorField, periodic: bool | Sequence[bool] = False
 def gaussian_curvature(field: TensorField, periodic: bool | Sequence[bool] = False) -> Float[Array, "*shape"]:
     """Return the Gaussian curvature K of a two-dimensional metric at the nodes.
 
-    If the field was made from a function, K is exact, from JAX derivatives. Otherwise K comes from finite differences
-    of sixth order of the nodal tensors, which are one-sided near the edges of the grid and the mask. K is NaN outside
-    the mask, and where no stencil of 7 nodes along a grid line fits into it (8 for second derivatives near an edge).
+    If the field was made from a function, JAX differentiates it, and K is exact. Otherwise K comes from sixth-order
+    finite differences of the nodal tensors. The differences are one-sided near the edges of the grid and the mask. K is
+    NaN outside the mask and where no stencil fits into it. A stencil is a row of 7 nodes, or 8 near an edge.
 
     Args:
-        periodic: whether the axes are periodic (node n is node 0), one value for all or one per axis.
+        periodic: whether the axes are periodic, so that node n is node 0; one value for all axes, or one per axis.
 
     Raises:
         ValueError: a field that is not 2D; fewer than 8 nodes along an axis of a nodal field; a bad `periodic`.
@@ -84,7 +84,7 @@ _PLANES = {2: ((0, 1),), 3: ((1, 2), (2, 0), (0, 1))}
 
 
 def riemann(metric: Jet) -> Float[Array, "... p p"]:
-    """Return the curvature tensor R_abcd of a metric in 2 or 3 dimensions, where ab and cd run over p planes:
+    """Return the curvature tensor R_abcd of a 2D or 3D metric, where the pairs ab and cd run over p coordinate planes:
 
         R_abcd = ½(∂_b∂_c g_ad + ∂_a∂_d g_bc − ∂_a∂_c g_bd − ∂_b∂_d g_ac) + ⟨Γ_bc, Γ_ad⟩ − ⟨Γ_bd, Γ_ac⟩
 
@@ -113,8 +113,8 @@ def riemann(metric: Jet) -> Float[Array, "... p p"]:
 def einstein(metric: Jet) -> Float[Array, "... 3 3"]:
     """Return the Einstein tensor (Ric − ½Rg)ⁱʲ of a three-dimensional metric.
 
-    The Einstein tensor is the double dual of the curvature tensor, which it determines in three dimensions: component
-    ij is −R_abcd/|g|, where the planes ab and cd are perpendicular to the axes i and j.
+    The Einstein tensor is the double dual of the curvature tensor R_abcd. Component ij is −R_abcd/|g|, where the
+    coordinate planes ab and cd are perpendicular to the axes i and j.
     """
     return -riemann(metric) / spd.determinant(metric.value)[..., None, None]
 
@@ -132,9 +132,9 @@ def gaussian(metric: Jet) -> Float[Array, "..."]:
 
 
 def scalar_and_ricci_squared(metric: Jet) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Return R and |Ric|² = RicᵢⱼRicⁱʲ of a three-dimensional metric.
+    """Return the scalar curvature R and |Ric|² = RicᵢⱼRicⁱʲ of a three-dimensional metric.
 
-    With the Einstein tensor G, R = −2 tr G and |Ric|² = |G|² + R²/4.
+    If G is the Einstein tensor, R = −2 tr G and |Ric|² = |G|² + R²/4.
     """
     mixed = jnp.sum(einstein(metric)[..., :, :, None] * metric.value[..., None, :, :], axis=-2)
     R = -2 * jnp.trace(mixed, axis1=-2, axis2=-1)
@@ -147,10 +147,10 @@ def laplace_beltrami(
     f: Float[Array, "*shape"] | Callable[[Array], Array],
     periodic: bool | Sequence[bool] = False,
 ) -> Float[Array, "*shape"]:
-    """Return ∇²f = div grad f = (1/√g) ∂ₐ(√g gᵃᵇ ∂ᵦf) at the nodes, negative at a peak of f (geometers' −Δf).
+    """Return ∇²f = div grad f = (1/√|g|) ∂ₐ(√|g| gᵃᵇ ∂ᵦf) at the nodes; ∇²f is negative at a peak of f.
 
-    If the metric or `f` is a function, its derivatives are exact. Derivatives of nodal values are finite differences of
-    sixth order, and NaN as in `gaussian_curvature`.
+    If the metric or `f` is a function, its derivatives are exact. Derivatives of nodal values are sixth-order finite
+    differences, and NaN under the conditions that `gaussian_curvature` states.
 
     Args:
         field: the metric, d = 2 or 3.
@@ -158,7 +158,7 @@ def laplace_beltrami(
         periodic: as in `gaussian_curvature`.
 
     Raises:
-        ValueError: values of another shape; fewer than 8 nodes along an axis with differences; a bad `periodic`.
+        ValueError: values of another shape; fewer than 8 nodes along an axis of nodal values; a bad `periodic`.
 
     Examples:
         >>> print(hj.laplace_beltrami(field, lambda x: (x + 0.3) @ (x + 0.3))[4, 4].round(3))  # of r²
@@ -190,7 +190,7 @@ def _laplace_beltrami(field: TensorField, f: Array | jtu.Partial, wraps: tuple[b
 
 
 def laplacian(metric: Jet, scalar: Jet) -> Float[Array, "..."]:
-    """Return gᵃᵇ(∂ₐ∂ᵦf − Γᶜₐᵦ ∂_c f) from the jets of the metric (to first order) and of f."""
+    """Return gᵃᵇ(∂ₐ∂ᵦf − Γᶜₐᵦ ∂_c f) from the jet of the metric, without its second derivatives, and the jet of f."""
     inverse = spd.inverse(metric.value)
     raised = jnp.sum(inverse * scalar.gradient[..., None, :], axis=-1)
     connection = jnp.sum(christoffel(metric) * raised[..., :, None, None], axis=-3)

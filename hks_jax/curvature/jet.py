@@ -1,4 +1,4 @@
-"""Quantities with their first and second derivatives, by JAX for functions, by differences for nodal values."""
+"""Quantities and their first and second derivatives: of functions by JAX, of nodal values by finite differences."""
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
@@ -16,15 +16,15 @@ from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_field import TensorField
 
 MINIMUM_NODES = 8
-"""The width of the widest stencil, that of a one-sided second derivative of sixth order."""
+"""The number of nodes of the widest stencil, which gives a one-sided second derivative of sixth order."""
 
 
 @lru_cache
 def stencils(order: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the stencils of sixth order for the derivative of the given order, 1 or 2, in order of preference.
 
-    A stencil is a row of the offsets (n, 8) and the weights (n, 8) for unit spacing, padded with zeros. For the second
-    derivative, a centred stencil of 7 nodes gains an order by symmetry; shifted stencils need 8 nodes.
+    Row i of the offsets (n, 8) and of the weights (n, 8) is stencil i for unit spacing, padded with zeros. For the
+    second derivative, a centred stencil of 7 nodes gains an order by symmetry; shifted stencils need 8 nodes.
     """
     width = 6 + order
     centred = np.arange(-3, 4)
@@ -49,9 +49,9 @@ def differentiate(
     spacing: float,
     wraps: bool,
 ) -> tuple[Float[Array, "*shape_and_components"], Bool[np.ndarray, "*shape"]]:
-    """Return the first or second derivative of nodal values along a grid axis, and the nodes where this is known.
+    """Return the first or second derivative of nodal values along a grid axis, and the nodes where it is known.
 
-    Only values at nodes inside the domain are used. The derivative is 0 where no stencil lies inside.
+    Only values at nodes inside the domain are used. The derivative is 0 where no stencil lies inside the domain.
     """
     offsets, weights = stencils(order)
     n, d = inside.shape[axis], inside.ndim
@@ -74,7 +74,7 @@ def differentiate(
 def _choose(
     inside: np.ndarray, offsets: np.ndarray, axis: int, wraps: bool
 ) -> tuple[np.ndarray, Bool[np.ndarray, "*shape"]]:
-    """Return for each node the first stencil with all nodes inside (0 if none fits), and whether a stencil fits."""
+    """Return for each node the first stencil with all nodes inside, or 0, and whether such a stencil exists."""
     reach = MINIMUM_NODES - 1
     width = [(reach, reach) if a == axis else (0, 0) for a in range(inside.ndim)]
     padded = np.pad(inside, width, mode="wrap") if wraps else np.pad(inside, width)
@@ -120,7 +120,7 @@ def nodal_jet(
     inside: Bool[np.ndarray, "*shape"],
     wraps: tuple[bool, ...],
 ) -> tuple[Jet, Bool[np.ndarray, "*shape"]]:
-    """Return the jets of nodal values by differences, and the nodes where all their derivatives are known."""
+    """Compute the jets of nodal values by finite differences; also return the nodes where all derivatives are known."""
     if min(grid.shape) < MINIMUM_NODES:
         raise ValueError(
             f"grid: got shape {grid.shape}; expected at least {MINIMUM_NODES} nodes on every axis, for differences "
@@ -155,14 +155,14 @@ def inner(inverse: Float[Array, "... d d"], p: Float[Array, "... d"], q: Float[A
 
 
 def metric_function(field: TensorField) -> Callable[[Array], Array]:
-    """Return the field's function with symmetric values in the dtype of its argument; NaN if not positive definite."""
+    """Return the field's function, symmetrised, in the dtype of its argument; NaN where it is not positive definite."""
     function = field.function
     assert function is not None
     return lambda x: spd.positive_or_nan(spd.symmetrise(jnp.asarray(function(x), x.dtype)))
 
 
 def metric_jet(field: TensorField, wraps: tuple[bool, ...]) -> tuple[Jet, Bool[np.ndarray, "*shape"]]:
-    """Return the jets of a metric at the nodes, (*shape, d, d, …), and the nodes where they are known."""
+    """Return the jets of a metric at the nodes, (*shape, d, d, …), and the nodes where the jets are known."""
     inside = domain_nodes(field.grid, wraps)
     if field.function is None:
         return nodal_jet(field.domain_tensors, field.grid, inside, wraps)
@@ -176,13 +176,13 @@ def domain_nodes(grid: Grid, wraps: tuple[bool, ...]) -> Bool[np.ndarray, "*shap
 
 
 def at_nodes(fn: Callable[[Array], Any], grid: Grid, inside: Bool[np.ndarray, "*shape"]) -> Any:
-    """Evaluate a function of position at every node; arrays in the result have the shape (*shape, …) of the grid.
+    """Evaluate a function of position at every node; each array in the result has the shape (*shape, …).
 
-    Nodes outside the domain get the value at a node inside. The function may be undefined outside the domain, and NaN
-    would spoil gradients even if it is masked afterwards.
+    Nodes outside the domain get the value at a node inside, because the function may be undefined outside. Its NaN
+    would enter the gradients even if NaN were masked afterwards.
     """
     flat = np.where(inside[..., None], grid.nodes, grid.nodes[inside][0]).reshape(-1, grid.dimension)
-    # High derivatives have many intermediates per node. Batches limit their memory and keep them in the cache.
+    # High derivatives have many intermediates per node; batches limit their memory and keep them in the cache.
     n_batches = -(-grid.size // _BATCH)
     batches = np.resize(flat, (n_batches, -(-grid.size // n_batches), grid.dimension))
     values = jax.lax.map(jax.vmap(fn), jnp.asarray(batches, jnp.result_type(float)))

@@ -1,8 +1,8 @@
 """Truncated Taylor series in two variables.
 
 A series is the vector of its coefficients in the order 1, x, y, x², xy, y², …, by total degree. So a shorter vector is
-a truncation of the series, and operations on several series return the length of the shortest one. Nested JAX
-derivatives would compute each mixed derivative in every order, and take several times as long to compile and to run.
+a truncation of the series, and operations on several series truncate all of them to the shortest one. Nested JAX
+derivatives would compute each mixed derivative for every order of the variables, and take several times as long.
 """
 
 from collections.abc import Callable
@@ -21,8 +21,8 @@ def expand(fn: Callable[[Array], Array], x: Float[Array, " 2"], degree: int) -> 
     """Return the Taylor series of a function at a point, exact to rounding.
 
     Derivatives along a line are cheap, because only one variable changes. The derivatives along degree + 1 lines
-    determine the mixed derivatives: Dᵏf along (c, s) is k! Σⱼ cᵏ⁻ʲ sʲ fₖⱼ. For equidistant angles this is
-    well-conditioned.
+    determine the mixed derivatives: derivative number k along (c, s) is k! Σⱼ cᵏ⁻ʲ sʲ fₖⱼ, where fₖⱼ is the coefficient
+    of xᵏ⁻ʲyʲ. For equidistant angles of the lines, the equations for fₖⱼ are well-conditioned.
     """
     angles = np.pi * np.arange(degree + 1) / (degree + 1)
     c, s = np.cos(angles)[:, None], np.sin(angles)[:, None]
@@ -46,7 +46,7 @@ def expand(fn: Callable[[Array], Array], x: Float[Array, " 2"], degree: int) -> 
 
 
 def _with_next(derivatives: Callable[[Array], tuple[Array, ...]]) -> Callable[[Array], tuple[Array, ...]]:
-    """Append the derivative of the last entry to the function's result."""
+    """Return the function that also returns the derivative of the last entry."""
 
     def last(t: Array) -> tuple[Array, tuple[Array, ...]]:
         known = derivatives(t)

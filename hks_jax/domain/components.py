@@ -30,7 +30,7 @@ def wrap_nodes(nodes: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
 
 
 def _corners(dimension: int) -> list[tuple[slice, ...]]:
-    """Return the slices that select the nodes at each corner of all elements from the result of `wrap_nodes`."""
+    """Return slices for each corner, which select this corner of all elements from the result of `wrap_nodes`."""
     return list(product(*[(slice(None, -1), slice(1, None))] * dimension))
 
 
@@ -41,7 +41,7 @@ def active_elements(mask: Bool[np.ndarray, "*shape"], periodic: tuple[bool, ...]
 
 
 def element_nodes(elements: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
-    """Mark the nodes of marked elements; for numbered elements, return the greatest number around each node."""
+    """Mark the nodes of marked elements; if elements are numbered, return the greatest number at each node."""
     nodes = np.zeros([n + 1 for n in elements.shape], elements.dtype)
     for corner in _corners(elements.ndim):
         np.maximum(nodes[corner], elements, out=nodes[corner])

@@ -1,4 +1,4 @@
-"""Degenerate points of a tensor field in two dimensions: where its eigenvalues are equal."""
+"""Degenerate points of a two-dimensional tensor field: the points where its two eigenvalues are equal."""
 
 from typing import NamedTuple
 
@@ -27,12 +27,12 @@ class DegeneratePoints(NamedTuple):
 def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
     """Find the points of a 2D field where the two eigenvalues are equal, and the topological index of each.
 
-    At these points the vector (T₁₁ − T₂₂, 2T₁₂) vanishes. The vector turns twice as fast as the eigenvectors,
-    and is interpolated bilinearly. A cell around which it turns has one zero of index ±½, a wedge or a trisector. Close
-    zeros are merged into one point with the sum of their indices (Tricoche, Scheuermann and Hagen 2001).
+    For the tensor T, the vector (T₁₁ − T₂₂, 2T₁₂) vanishes at these points. This vector is interpolated bilinearly, and
+    turns twice as fast as the eigenvectors. A cell around which the vector turns has one zero, of index ½ (wedge) or −½
+    (trisector). Close zeros are merged into one point with the sum of their indices (Tricoche and others 2001).
 
     Points of index 0, pairs of opposite index that are closer than `merge`, and points on the rim of the domain are not
-    found. If eigenvalues are equal on a curve or in a region off the rim, its centre is returned unless its index is 0.
+    found. If eigenvalues are equal on a curve or in a region off the rim, the centre is found unless the index is 0.
 
     Args:
         field: a 2D field. Cells with a node outside the mask are not part of the domain.
@@ -72,7 +72,7 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
     graph = coo_matrix((np.ones(len(near)), near.T), shape=(len(cells),) * 2)
     count, cluster = connected_components(graph, directed=False)
     turns = winding[tuple(cells.T)]
-    # Several cells share a zero on an edge or node. The turns in each cell are arbitrary, but their sum is not.
+    # A zero on an edge or node belongs to several cells. The turns in each cell are arbitrary, but their sum is not.
     index = np.bincount(cluster, turns, count) / 2
     settled = np.bincount(cluster, on_rim[tuple(cells.T)], count) == 0
     shared = crossed[tuple(cells.T)]
@@ -89,7 +89,7 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
 def _windings(
     v: Float[np.ndarray, "nx ny 2"], tiny: Float[np.ndarray, "nx ny"], active: Bool[np.ndarray, "mx my"]
 ) -> tuple[Int[np.ndarray, "mx my"], Bool[np.ndarray, "mx my"], Bool[np.ndarray, "mx my"]]:
-    """Return the turns of v around each cell; mark the cells with a zero on an edge, and with a zero on the rim."""
+    """Return the turns of v around each cell; mark cells with a zero on an edge, and cells with a zero on the rim."""
     angle = np.arctan2(v[..., 1], v[..., 0])
     zero = np.hypot(v[..., 0], v[..., 1]) <= tiny
     number = np.zeros(active.shape)
@@ -123,7 +123,7 @@ def _ends(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _zeros_in_cells(v: Float[np.ndarray, "nx ny 2"], cells: Int[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """Return the zero of the bilinear interpolant in each cell, in units of the cell's sides, or else its centre.
+    """Return the zero of the bilinear interpolant in each cell, or the cell's centre, in units of the cell's sides.
 
     Eliminating x from both components of a₀ + a₁x + a₂y + a₃xy = 0 gives a quadratic equation in y.
     """

@@ -23,7 +23,7 @@ Metric = Callable[[Point], Float[Array, "d d"]]
 
 
 def pullback(parametrisation: Callable[[Point], Float[Array, " m"]]) -> Metric:
-    """Return the pullback metric x ↦ JᵀJ of a map from coordinates (d,) into space (m,) with the Jacobian J.
+    """Return the pullback metric x ↦ JᵀJ of a map from coordinates (d,) into space (m,), where J is the map's Jacobian.
 
     Examples:
         >>> metric = hj.examples.pullback(lambda x: x[0] * jnp.stack([jnp.cos(x[1]), jnp.sin(x[1])]))
@@ -99,7 +99,7 @@ def bumpy_torus_mesh(n: int) -> SurfaceMesh:
 def sphere_mesh(n: int) -> SurfaceMesh:
     """Return the unit sphere as a subdivided icosahedron with 20n² triangles and 10n² + 2 vertices.
 
-    For n = 71 it has 50 412 vertices. The eigenvalues of the sphere are l(l + 1) with the multiplicity 2l + 1.
+    For n = 71 the mesh has 50 412 vertices. The eigenvalues of the sphere are l(l + 1) with the multiplicity 2l + 1.
 
     Examples:
         >>> mesh = hj.examples.sphere_mesh(3)
@@ -140,7 +140,7 @@ def _stereographic(x: Float[Array, " 2"], sign: float) -> Float[Array, "2 2"]:
 def sphere_field(n: int, half_width: float = 3.0) -> TensorField:
     """Return the unit sphere (K = 1) in its stereographic chart, with n × n nodes on (−half_width, half_width)².
 
-    The sides' midpoints are 2 arctan(half_width) away from the centre; a region around the other pole is missing.
+    The sides' midpoints have the geodesic distance 2 arctan(half_width) from the centre. The opposite pole is missing.
 
     Examples:
         >>> print(hj.gaussian_curvature(hj.examples.sphere_field(9))[4, 4].round(3))
@@ -191,7 +191,7 @@ def figure3_fields(n: int) -> dict[str, TensorField]:
 
 
 def rotated(angle: Callable[[Point], Array], major: float, minor: float) -> Metric:
-    """Return the metric with these eigenvalues whose major eigenvector has the angle ``angle(u)`` to axis 0.
+    """Return the metric with eigenvalues ``major`` and ``minor``; the major eigenvector has the ``angle(u)`` to axis 0.
 
     Examples:
         >>> metric = hj.examples.rotated(lambda u: jnp.pi / 2 + 0 * u[0], major=4.0, minor=1.0)
@@ -208,7 +208,7 @@ def rotated(angle: Callable[[Point], Array], major: float, minor: float) -> Metr
 
 
 def figure4_fields(n: int, major: float = 4.0, minor: float = 1.0) -> dict[str, TensorField]:
-    """Return fields of constant eigenvalues and analytic eigenvectors on n × n nodes of (0, 1)² (paper, Fig. 4).
+    """Return fields with constant eigenvalues and analytic eigenvectors on n × n nodes of (0, 1)² (paper, Fig. 4).
 
     All fields have the same constant trace, determinant and anisotropy; only the eigenvectors differ. The centre of
     ``"circles"`` and ``"spirals"`` is (−0.3, −0.3), outside the square. The fields ``"straight"``, ``"circles"`` and

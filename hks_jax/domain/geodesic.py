@@ -1,4 +1,4 @@
-"""Meshes of the unit sphere and ball with cells of nearly equal size, by subdivision of an icosahedron."""
+"""Meshes of the unit sphere and ball with cells of nearly equal size, made by subdividing an icosahedron."""
 
 from itertools import permutations, product
 
@@ -12,7 +12,7 @@ def _icosahedron() -> tuple[Float[np.ndarray, "12 3"], Int[np.ndarray, "20 3"]]:
     golden = (1 + np.sqrt(5)) / 2
     one = [(0, a, b * golden) for a, b in product((-1, 1), repeat=2)]
     vertices = np.array([np.roll(v, turn) for turn in range(3) for v in one], dtype=float)
-    near = np.linalg.norm(vertices[:, None] - vertices, axis=-1) < 2.1  # its edges have length 2
+    near = np.linalg.norm(vertices[:, None] - vertices, axis=-1) < 2.1  # the edges have length 2
     triples = [(i, j, k) for i in range(12) for j in range(i) for k in range(j)]
     faces = np.array([t for t in triples if near[t[0], t[1]] and near[t[1], t[2]] and near[t[2], t[0]]])
     return vertices / np.linalg.norm(vertices, axis=1, keepdims=True), faces
@@ -41,7 +41,7 @@ def _kuhn(n: int, dimension: int) -> tuple[Int[np.ndarray, "p corners"], Int[np.
 def _glued(
     simplices: Int[np.ndarray, "s corners"], n: int
 ) -> tuple[Int[np.ndarray, "V 13"], Int[np.ndarray, "cells corners"]]:
-    """Subdivide simplices on 12 corners and the centre; return n times the barycentric coordinates, and the cells."""
+    """Subdivide simplices whose corners are among the 12 vertices and the centre; return the same as `_kuhn`."""
     weights, cells = _kuhn(n, simplices.shape[1] - 1)
     shares = np.zeros((len(simplices), len(weights), _CENTRE + 1), np.int16)
     for i, simplex in enumerate(simplices):
@@ -53,7 +53,7 @@ def _glued(
 def geodesic(n: int, dimension: int) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "cells corners"]]:
     """Return the points and cells of the unit sphere (dimension 2, triangles oriented outward) or ball (3, tetrahedra).
 
-    The sphere has 10n² + 2 points and 20n² triangles. The ball has n layers about its centre, with 20n³ tetrahedra.
+    The sphere has 10n² + 2 points and 20n² triangles. The ball has n layers about its centre and 20n³ tetrahedra.
     """
     corners, faces = _icosahedron()
     shares, cells = _glued(faces if dimension == 2 else np.insert(faces, 0, _CENTRE, axis=1), n)

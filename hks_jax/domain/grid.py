@@ -25,8 +25,8 @@ class Grid(ByKey):
         shape: the number of nodes along each of 2 or 3 axes, at least 2 per axis.
         spacing: the distance between nodes along each axis (or one number for all axes), in coordinate units.
         origin: the coordinates of node (0, …, 0).
-        mask: bool array of `shape`, True inside. The domain is the union of the elements with all nodes inside; results
-            are NaN at nodes that belong to none of these elements. None: the whole grid.
+        mask: bool array of `shape`, True inside; None is the whole grid. The domain is the union of the elements whose
+            nodes are all inside. Results are NaN at nodes outside the domain.
         components: the treatment of a mask with several connected components: ``"raise"`` (default) raises an error
             with their number, ``"largest"`` keeps the one with the most nodes, ``"all"`` keeps all.
 
@@ -120,7 +120,7 @@ class Grid(ByKey):
 
     @cached_property
     def unit(self) -> "Grid":
-        """The grid of this shape and mask with spacing 1 and origin 0, which determines sparsity patterns."""
+        """The grid with the same shape and mask, spacing 1 and origin 0, which determines sparsity patterns."""
         unit = Grid(self.shape)
         unit._mask = self._mask
         return unit

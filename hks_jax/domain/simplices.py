@@ -12,7 +12,7 @@ from hks_jax.domain.components import as_mask
 from hks_jax.domain.triangulation import Triangulation
 
 _FLAT = 1e-10
-"""A simplex is degenerate if d! times its volume, relative to the d-th power of its longest edge, is at most this."""
+"""A simplex is degenerate if d! times its volume is at most this number times the d-th power of its longest edge."""
 _ON_EDGE = 1e-6
 """A vertex is on an edge if its distance from the edge is at most this fraction of the edge's length."""
 
@@ -148,7 +148,7 @@ def check_places(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulatio
 
 
 def check_metric(metric: Float[np.ndarray, "n d d"], cells: Int[np.ndarray, "n corners"]) -> None:
-    """Raise ValueError if the metric of space on a simplex is NaN, because rounding exceeds its height."""
+    """Raise ValueError if the induced metric of a simplex is NaN, because rounding exceeds the simplex's height."""
     thin = np.isnan(metric).any(axis=(1, 2))
     if not thin.any():
         return
@@ -174,7 +174,7 @@ def _check_once(faces: Int[np.ndarray, "F 3"]) -> None:
 
 
 def _warn_of_hanging(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulation) -> None:
-    """Warn if boundary edges pass through a vertex. The surface is torn there, as one side has more vertices."""
+    """Warn if boundary edges pass through a vertex. There the surface is torn, as its two sides differ in vertices."""
     edges = triangulation.facet_vertices(triangulation.boundary_facets)
     rim = np.unique(edges)
     if not rim.size:

@@ -65,14 +65,14 @@ class SimplicialMesh(eqx.Module):
     ) -> Mesh:
         """Return the mesh with a metric made of tensors D in space; a surface uses only their tangential parts.
 
-        The tangential part is the quadratic form D on the plane of a triangle. For diffusion tensors it describes
-        diffusion within the surface, with the diffusivities that were measured in it. The choice of the metric g has no
-        default (see `TensorField.from_diffusion`): ``"tensor"``, g = D; ``"inverse"``, g = D⁻¹; ``"adjugate"``,
-        g = |D| D⁻¹. On a surface D stands for its tangential part. If D is the identity, g is the metric of space.
+        The tangential part of D is its quadratic form on the plane of a triangle. For diffusion tensors the tangential
+        part describes diffusion within the surface. The choice of the metric g has no default (see
+        `TensorField.from_diffusion`): ``"tensor"``, g = D; ``"inverse"``, g = D⁻¹; ``"adjugate"``, g = |D| D⁻¹. On a
+        surface D stands for its tangential part. If D is the identity, g is the metric of space.
 
         If the tensors are given at vertices, each cell takes the mean of the tensors at its vertices, or with
         ``"log-euclidean"`` the exponential of the mean of their logarithms. The mean is the interpolant at the centre
-        of the cell. The error of this approximation is of second order, like the error of the elements. The metric is
+        of the cell. The error of one tensor per cell is of second order, like the error of the elements. The metric is
         differentiable with respect to tensors and vertices.
 
         Args:
@@ -88,7 +88,7 @@ class SimplicialMesh(eqx.Module):
 
         Raises:
             ValueError: an unknown metric or interpolation; wrong shapes; tensors that are NaN, infinite, unsymmetric or
-                not positive definite (with their number and the first place); the errors of the class.
+                not positive definite (with their number and the first place); the errors that the class raises.
         """
         mesh = cls(vertices, cells, mask=mask)
         check_metric_choice(metric)
@@ -99,7 +99,7 @@ class SimplicialMesh(eqx.Module):
             _check_tensors(np.asarray(array), np.asarray(edges), triangulation, at_vertices)
         corners = triangulation.cells if at_vertices else np.arange(len(array))[:, None]
         of_cells = _tangential_metric(edges, array, corners, metric, interpolation if at_vertices else "linear")
-        given = _checked_metric(of_cells, triangulation)  # an inverse may overflow
+        given = _checked_metric(of_cells, triangulation)  # inverting the tensors may overflow
         return eqx.tree_at(lambda m: m._metric, mesh, given, is_leaf=lambda leaf: leaf is None)
 
     def __repr__(self) -> str:
@@ -136,7 +136,7 @@ class SurfaceMesh(SimplicialMesh):
         metric: (F, 2, 2), the metric of triangles in the basis of edges v₁ − v₀ and v₂ − v₀, in place of the induced
             metric.
         mask: bool, True inside the domain: (F,) for the triangles, or (V,) for the vertices. A triangle is inside if
-            all of its vertices are. Triangles outside may be degenerate or NaN. The rim of the mask belongs to the
+            all its vertices are inside. Triangles outside may be degenerate or NaN. The rim of the mask belongs to the
             boundary, results are NaN at vertices outside, and ``faces`` has only the triangles inside.
 
     Raises:
@@ -200,8 +200,8 @@ class TetMesh(SimplicialMesh):
         """Return the surface of the triangles that belong to only one tetrahedron, with the metric of space.
 
         Returns:
-            The surface, oriented outward, and the indices (B,) of its vertices in this mesh. If they are ``numbers``,
-            values (…, V) on this mesh are ``values[..., numbers]`` on the surface.
+            The surface, oriented outward, and the indices (B,) of its vertices in this mesh. If ``numbers`` are these
+            indices, values (…, V) on this mesh are ``values[..., numbers]`` on the surface.
         """
         triangulation = self.triangulation
         numbers, faces = np.unique(triangulation.facet_vertices(triangulation.boundary_facets), return_inverse=True)

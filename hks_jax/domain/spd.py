@@ -1,4 +1,4 @@
-"""Small symmetric positive definite matrices: d = 2 and 3, batched over leading axes."""
+"""Functions of small symmetric positive definite matrices (..., d, d), where d is 2 or 3."""
 
 import math
 from functools import partial
@@ -23,7 +23,7 @@ def symmetrise(xp: Any, tensors: Any) -> Any:
 def identity_outside(
     tensors: Float[Array, "*shape d d"], inside: Bool[np.ndarray | Array, "*shape"]
 ) -> Float[Array, "*shape d d"]:
-    """Return the tensors, replaced by the identity at nodes outside the mask."""
+    """Return the tensors inside the mask, and the identity at nodes outside the mask."""
     return tensors if isinstance(inside, np.ndarray) and inside.all() else _identity_outside(tensors, inside)
 
 
@@ -67,7 +67,7 @@ def metric_of_diffusion(tensors: Any, metric: str) -> Any:
 
 
 def cholesky(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
-    """Return the lower triangular L with T = LLᵀ for positive semidefinite T. Columns with a zero pivot are zero."""
+    """Return the lower triangular L with T = LLᵀ for positive semidefinite T. A column is zero if its pivot is zero."""
     factor = jnp.zeros_like(tensors)
     for j in range(tensors.shape[-1]):
         column = tensors[..., j] - jnp.sum(factor * factor[..., j, None, :], axis=-1)
@@ -110,7 +110,7 @@ _SQUARINGS, _TERMS = 8, 20
 
 
 @jax.jit
-@jax.checkpoint  # so that reverse mode stores the matrices, not a hundred numbers for each
+@jax.checkpoint  # so that reverse mode stores the matrices, not a hundred numbers per matrix
 def exp(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
     """Return the exponential of symmetric matrices, d = 2 or 3."""
     d, tensors = tensors.shape[-1], symmetrise(tensors)
@@ -123,7 +123,7 @@ def exp(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
 
 
 def _exp_in_2d(deviator: Float[Array, "... 2 2"]) -> tuple[list[Array], list[Array]]:
-    """Return [S] and the coefficients of I and S in exp S − I; tr S = 0."""
+    """Return [S] and the coefficients of I and S in exp S − I, where S is the deviator, so that tr S = 0."""
     q = jnp.square(deviator[..., 0, 0]) + jnp.square(deviator[..., 0, 1])
     small = q / 4**_SQUARINGS
     a = b = jnp.zeros_like(q)
@@ -137,7 +137,7 @@ def _exp_in_2d(deviator: Float[Array, "... 2 2"]) -> tuple[list[Array], list[Arr
 
 
 def _exp_in_3d(deviator: Float[Array, "... 3 3"]) -> tuple[list[Array], list[Array]]:
-    """Return [S, S²] and the coefficients of I, S and S² in exp S − I; tr S = 0."""
+    """Return [S, S²] and the coefficients of I, S and S² in exp S − I, where S is the deviator, so that tr S = 0."""
     square = matmul(deviator, deviator)
     p, r = 0.5 * jnp.trace(square, axis1=-2, axis2=-1), determinant(deviator)
     small_p, small_r = p / 4**_SQUARINGS, r / 8**_SQUARINGS

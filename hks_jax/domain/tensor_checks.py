@@ -29,7 +29,7 @@ def check_metric_choice(metric: str | None) -> None:
 
 
 def checked_interpolation(interpolation: Any) -> Interpolation:
-    """Return the name of an interpolation; raise ValueError for any other."""
+    """Return the name of an interpolation; raise ValueError for an unknown name."""
     if interpolation not in ("linear", "log-euclidean"):
         raise ValueError(f'interpolation: got {interpolation!r}; expected "linear" or "log-euclidean"')
     return interpolation
@@ -125,7 +125,7 @@ def right_cauchy_green(name: str, grid: Grid, F: Any) -> Float[Array, "*shape d 
         )
     if m == d and not is_traced(gradients):
         known = np.asarray(gradients, np.float64)
-        finite = grid.inside & np.isfinite(known).all(axis=(-2, -1))  # the check of the metric finds the others
+        finite = grid.inside & np.isfinite(known).all(axis=(-2, -1))  # the check of the metric finds NaN
         determinants = np.linalg.det(np.where(finite[..., None, None], known, np.eye(d)))
         bad = finite & (determinants <= 0)
         if bad.any():
@@ -160,7 +160,7 @@ def positive_map(
     inside: Bool[np.ndarray, "*shape"],
     place: str = "node",
 ) -> Float[Array, "*shape d d"]:
-    """Return exp(S/s) or S + c·I of symmetric tensors S; outside the mask S is replaced by the identity.
+    """Return exp(S/s) or S + c·I for symmetric tensors S; the number is s or c. Outside the mask S is the identity.
 
     Raises:
         ValueError: an unknown map; NaN, infinite or unsymmetric tensors; an invalid scale or shift; a singular result.

@@ -39,7 +39,7 @@ class TensorField(eqx.Module):
         tensors: (*shape, d, d), symmetric positive definite inside the mask; ``tensors[i, j, 0, 1]`` is T₁₂ at node
             (i, j). Units: (length / coordinate unit)². Values outside the mask are ignored.
         interpolation: the interpolation between the nodes. With ``"linear"`` the components are multilinear, as in
-            Zobel, Reininghaus and Hotz; if tensors rotate from node to node, the determinant is larger in between. With
+            Zobel, Reininghaus and Hotz; if tensors rotate, the determinant is larger between the nodes. With
             ``"log-euclidean"`` the components of the logarithm are multilinear (Arsigny, Fillard, Pennec and Ayache).
             Then the logarithm of the determinant is multilinear, and T⁻¹ is interpolated in the same way as T.
 
@@ -71,7 +71,7 @@ class TensorField(eqx.Module):
         """Return the metric ``fn``, which maps coordinates (d,) to a tensor (d, d) and is differentiable by JAX.
 
         The field keeps the function, so that curvature and its derivatives are exact; `assemble` interpolates between
-        its values at the nodes. Traced parameters belong in a `jax.tree_util.Partial` or an Equinox module.
+        the function's values at the nodes. Traced parameters belong in a `jax.tree_util.Partial` or an Equinox module.
 
         Examples:
             >>> grid = hj.Grid.from_bounds(1, 2, (9, 9))
@@ -87,7 +87,7 @@ class TensorField(eqx.Module):
     def _checked(
         cls, grid: Grid, interpolation: Interpolation, tensors: Any = None, function: Any = None
     ) -> "TensorField":
-        """Return a field without another check of its tensors."""
+        """Return a field without another check of its tensors or of its function's values."""
         field, interpolation = cls.__new__(cls), checked_interpolation(interpolation)
         values = {"grid": grid, "interpolation": interpolation, "function": function, "_tensors": tensors}
         for name, value in values.items():
@@ -108,12 +108,12 @@ class TensorField(eqx.Module):
 
         There is no default for ``metric``, because several conventions are in use:
 
-        - ``"inverse"``: g = D⁻¹, whose distances are the distances of diffusion with diffusivity D (t in units of
-          time);
+        - ``"inverse"``: g = D⁻¹, whose distances are the distances of diffusion with diffusivity D; t has units of
+          time;
         - ``"tensor"``: g = D, as in Zobel, Reininghaus and Hotz;
         - ``"adjugate"``: g = |D| D⁻¹, the inverse scaled so that |g| = |D|^(d−1).
 
-        The metric g is interpolated between the nodes. With ``"log-euclidean"``, interpolating D would give the same.
+        The metric g is interpolated. With ``"log-euclidean"``, interpolation of D would give the same metric.
 
         Examples:
             >>> metric = hj.TensorField.from_diffusion(field.grid, field.tensors, metric="inverse")
@@ -133,10 +133,10 @@ class TensorField(eqx.Module):
         """Return the metric C = FᵀF of a deformation gradient F (*shape, d, d), the right Cauchy–Green tensor.
 
         ``F[..., i, j]`` is ∂yᵢ/∂xⱼ, where y is the position to which the point x moves, or would move without
-        constraints. The metric measures lengths after the deformation. A later rotation does not change it.
+        constraints. The metric measures lengths after the deformation. Later rotations do not change the metric.
 
-        If F is the gradient of a map, the metric is flat, and the signature is the signature of the deformed body. For
-        growth, plastic or elastic strain, the curvature of C is the incompatibility, or residual strain
+        If F is the gradient of a map, the metric is flat, and the signature is the signature of the deformed body. If F
+        describes growth, plastic or elastic strain, the curvature of C is the strain's incompatibility
         (docs/strain.md).
 
         Args:
@@ -170,22 +170,22 @@ class TensorField(eqx.Module):
     ) -> "TensorField":
         """Return a metric made of symmetric tensors S (*shape, d, d) with eigenvalues of either sign, such as stress.
 
-        Indefinite tensors are no metric. The function has two maps to a metric, and no default. Both maps keep the
+        Indefinite tensors define no metric. Two maps make a metric of them; neither is the default. Both maps keep the
         eigenvectors and the order of the eigenvalues (Hotz and others 2004):
 
         - ``"exp"``: g = exp(S/s), where `number` is the scale s > 0 in the units of S. An eigenvalue σ becomes
-          exp(σ/s). A scale near the largest |σ| shows S well.
+          exp(σ/s). Choose a scale near the largest |σ|.
         - ``"shift"``: g = S + c·I, where `number` is the shift c, larger than minus the least eigenvalue. The signature
           flattens as c grows. Near the least possible c, lengths along the strongest compression are almost zero.
 
-        docs/strain.md describes their signatures.
+        docs/strain.md describes the signatures of both metrics.
 
         Args:
             S: the tensors; values outside the mask are ignored.
             how: ``"exp"`` or ``"shift"``.
             number: the scale or the shift; may be traced.
-            interpolation: the interpolation of g between nodes. With ``"exp"``, ``"log-euclidean"`` is linear
-                interpolation of S.
+            interpolation: the interpolation of g between nodes. If ``how`` is ``"exp"``, ``"log-euclidean"``
+                interpolates S linearly.
             name: the name of S in messages.
 
         Raises:

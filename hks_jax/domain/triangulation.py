@@ -49,7 +49,7 @@ class Triangulation(ByKey):
 
     @cached_property
     def _grouped_facets(self) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-        """The facets sorted by their vertices; whether each is the first with these; the parity of their order."""
+        """The facets sorted by vertices; whether each is the first with its vertices; the parity of their order."""
         vertices = self.facet_vertices(np.arange(self.cells.size))
         odd = np.zeros(len(vertices), dtype=bool)
         for a, b in combinations(range(self.dimension), 2):
@@ -68,7 +68,7 @@ class Triangulation(ByKey):
 
     @cached_property
     def overlaps(self) -> Int[np.ndarray, "m 2"]:
-        """Pairs of cells with a common facet of the same orientation: positive cells lie on one side of the facet.
+        """Pairs of cells that orient a common facet equally; positively oriented cells then lie on the same side.
 
         If three or more cells share a facet, two of them lie on the same side.
         """
@@ -79,7 +79,7 @@ class Triangulation(ByKey):
 
     @cached_property
     def crowded_facets(self) -> Int[np.ndarray, " m"]:
-        """The facets that belong to three or more cells, each by one of its numbers."""
+        """One number of each facet that belongs to three or more cells."""
         order, begins, _ = self._grouped_facets
         starts = np.flatnonzero(begins)
         return order[starts[np.diff(np.append(starts, order.size)) > 2]]
@@ -117,12 +117,12 @@ class Triangulation(ByKey):
 
     @cached_property
     def used(self) -> Bool[np.ndarray, " V"]:
-        """Whether each vertex belongs to a cell, bool (V,). All vertices do, except outside of a mask."""
+        """Whether each vertex belongs to a cell, bool (V,). Only vertices outside a mask belong to no cell."""
         return np.isin(np.arange(self.n_vertices), self.cells)
 
     @cached_property
     def labels(self) -> tuple[Int[np.ndarray, " V"], int]:
-        """The connected component of each vertex (1 … n; 0 without a cell), and the number n of components."""
+        """The connected component of each vertex (1 … n, or 0 for a vertex without a cell), and the number n."""
         rows, cols = self.cells[:, :-1].ravel(), self.cells[:, 1:].ravel()
         graph = coo_matrix((np.ones(rows.size), (rows, cols)), shape=(self.n_vertices,) * 2)
         known, labels = np.unique(connected_components(graph, directed=False)[1][self.used], return_inverse=True)

@@ -40,19 +40,19 @@ def assemble(
 ) -> AnyPencil:
     """Assemble the generalized eigenproblem Kφ = λMφ of an operator, by default of the Laplace–Beltrami operator.
 
-    The matrices are K_ij = ∫ √|T| T⁻¹∇hᵢ·∇hⱼ and M_ij = ∫ √|T| hᵢhⱼ (Zobel, Reininghaus and Hotz, section 3). On grids
-    the elements are Q1 with 2^d Gauss points, and the metric T (or its logarithm, see `TensorField`) is interpolated
-    multilinearly. On meshes the elements are P1 or P2, and T is constant on each triangle or tetrahedron.
+    With the metric T and the basis functions hᵢ, K_ij = ∫ √|T| T⁻¹∇hᵢ·∇hⱼ and M_ij = ∫ √|T| hᵢhⱼ (Zobel, Reininghaus
+    and Hotz, section 3). On grids the elements are Q1 with 2^d Gauss points, and T or its logarithm is interpolated
+    multilinearly (see `TensorField`). On meshes the elements are P1 or P2, and T is constant on each cell.
 
     A *field* is a number, an array over the nodes, an array over the elements, or a function of position that JAX can
     trace. An array over the nodes, (*shape) or (V,), is interpolated. An array over the elements has n − 1 entries
-    along each axis of a grid (n if the axis is periodic), or an entry for each cell of a mesh. An array whose shape
-    fits both is taken as nodal.
+    along a grid axis of n nodes (n if the axis is periodic), or an entry for each cell of a mesh. An array whose shape
+    fits nodes and elements is taken as nodal.
 
     Args:
         domain: a tensor field, a `SurfaceMesh` or a `TetMesh`.
         boundary: ``"neumann"`` (natural), ``"dirichlet"`` (φ = 0: these nodes are eliminated), ``"periodic"`` (node n
-            is node 0: an axis of n nodes has the period n·h), ``"mirror"`` (the domain is reflected on every side) or
+            is node 0, so the period is n times the spacing), ``"mirror"`` (the domain is reflected on every side) or
             ``"mean"`` (two copies of the domain are glued along the whole rim). On grids give one name for all axes, or
             one entry per axis, which may be a pair (low, high) of ``"neumann"``, ``"dirichlet"`` and ``"mean"``. The
             condition on the rim of a mask is natural, except with ``"mean"`` and ``"dirichlet-rim"``, which act on the
@@ -64,20 +64,20 @@ def assemble(
         stiffness: your own form, which replaces potential and density: a function ``form(u, v, w)`` that is linear in u
             and in v and returns one number. The shape functions u and v have ``.value`` and ``.grad``. The point w has
             the metric ``.metric`` (d, d), its inverse ``.inverse``, the position ``.x`` and the fields ``w["name"]``.
-            The number is integrated with the volume element √|T| dx. On meshes, gradients and metric are in the axes
-            of space; on a surface they are tangential. Define a form once: each new function is compiled anew
-            (docs/operators.md).
+            The number is integrated with the volume element √|T| dx. On meshes, gradients and metric have components
+            along the axes of space; on a surface, gradients and metric are tangential. Define a form once: each new
+            function is compiled anew (docs/operators.md).
         fields: the fields that your forms read, by name; they may have further axes after those of nodes or elements.
         components: the number c of components of a function. For c > 1, as in elasticity, ``u.value`` is (c,),
             ``u.grad`` is (c, d) with ``grad[i, j]`` = ∂uᵢ/∂xⱼ, and results have an axis of length c after those of the
             nodes.
-        degree: 1 or, on meshes, 2. Nodal values of degree 2 are those at the V vertices, followed by those at the
-            midpoints of the edges ``domain.triangulation.edges``.
+        degree: 1 or, on meshes, 2. For degree 2, nodal arrays have the values at the V vertices, followed by the values
+            at the midpoints of the edges ``domain.triangulation.edges``.
         midpoints: for degree 2, the positions (E, 3) of the edges' midpoints, which curve the edges; or a function from
-            the midpoint of a straight edge to its new position, which on a `TetMesh` moves boundary edges only.
+            the midpoint of a straight edge to its new position. On a `TetMesh` the function moves boundary edges only.
         quadrature: ``"gauss"`` or, on grids, ``"cancelling"``: points for which the leading error of heat kernel
             signatures cancels (docs/accuracy.md). The mass is then consistent, and the unknowns φ are not nodal values:
-            all signatures compute nodal values as ½(I + D⁻¹M)φ, where D has the row sums of M.
+            all signatures compute nodal values as ½(I + D⁻¹M)φ, where the diagonal matrix D has the row sums of M.
 
     Returns:
         The pencil (stiffness, mass). With ``"mirror"`` and ``"mean"`` the result is the `MirrorPencil` of the problems
@@ -191,7 +191,7 @@ def _checked_operator(
 
 
 def _joined(pencils: list[Pencil], operator: WeakForm) -> AnyPencil:
-    """Return the pencil, or the problems of a doubled domain; check that the user's forms are symmetric."""
+    """Return the pencil, or the `MirrorPencil` of a doubled domain; check that the user's forms are symmetric."""
     if operator.own and operator.checked:
         for name in ("stiffness", "mass"):
             matrix = getattr(pencils[0], name)

@@ -19,14 +19,14 @@ BoundarySpec: TypeAlias = str | tuple[str | Sides, ...]
 _SIDE_BY_SIDE = ("neumann", "dirichlet", "mean")
 _CONDITIONS = (*_SIDE_BY_SIDE, "periodic", "mirror")
 _WHOLE_RIM = {"mean": "mean", "dirichlet-rim": "dirichlet"}
-"""The condition on the rim of a mask that each of these names sets, if it is given alone."""
+"""The condition that each of these names, if given alone, sets on all sides and on the rim of a mask."""
 
 
 def normalise_boundary(boundary: BoundarySpec, dimension: int) -> tuple[Sides, ...]:
     """Return a pair of conditions (low, high) for every axis, and a pair that repeats the condition on a mask's rim.
 
-    `assemble` describes the argument. By default, the rim's condition is ``"mean"`` if an axis has it, and natural
-    otherwise.
+    `assemble` describes the argument. By default, the rim's condition is ``"mean"`` if an axis has this condition, and
+    natural otherwise.
     """
     if isinstance(boundary, str):
         everywhere = _WHOLE_RIM.get(boundary)
@@ -68,8 +68,8 @@ def _pair(entry: str | Sides) -> Sides:
 def default_boundary(inside: Bool[np.ndarray, "*shape"]) -> tuple[str, str]:
     """Return the boundary condition that suits a domain, and the reason.
 
-    The condition is ``"mean"`` if the domain has a mask, since the natural condition on its rim would dominate
-    signatures. The command line uses this condition by default; the functions of the library use ``"neumann"``.
+    The condition is ``"mean"`` if the domain has a mask with inner nodes, since the natural condition on the rim would
+    dominate signatures. The command line uses this condition by default; the library's functions use ``"neumann"``.
 
     Args:
         inside: (*shape) the nodes of the domain, such as `Grid.inside`.
@@ -102,12 +102,12 @@ def unreached_sides(inside: Bool[np.ndarray, "*shape"], boundary: BoundarySpec) 
 
 
 def doubled_problems(boundary: tuple[Sides, ...]) -> list[tuple[Sides, ...]]:
-    """Return the problems whose spectra form the spectrum of the domain that ``"mirror"`` or ``"mean"`` doubles.
+    """Return the problems whose spectra together are the spectrum of a domain doubled by ``"mirror"`` or ``"mean"``.
 
     Functions on the doubled, periodic axis are even or odd about both mirrors. At the mirrors, even functions satisfy
     the Neumann condition, and odd functions vanish. So a mirror axis gives a Neumann and a Dirichlet problem, and m
-    mirror axes give 2^m problems. Likewise, two copies of a domain that are glued along the rim have even functions
-    (Neumann) and odd functions (Dirichlet). In the first problem, functions are even under all reflections.
+    mirror axes give 2^m problems. Likewise, functions on two copies of a domain that are glued along the rim are even
+    (Neumann) or odd (Dirichlet). In the first problem, functions are even under all reflections.
     """
     choices = [
         [("neumann", "neumann"), ("dirichlet", "dirichlet")] if sides == ("mirror", "mirror") else [sides]

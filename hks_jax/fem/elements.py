@@ -72,9 +72,9 @@ def tensor_product_element(dimension: int, point: float = GAUSS) -> Element:
     return Element(reduce(np.kron, [h] * dimension), np.stack(gradients, axis=-1), np.full(n, 1 / n))
 
 
-# The d + 1 points have equal weights and the barycentric coordinates 1 − d·a (once) and a (d times). The rule is exact
-# for polynomials of degree two if hᵢhⱼ, i ≠ j, has the mean 1/((d + 1)(d + 2)) over the points. Then
-# 2a(1 − d·a) + (d − 1)a² = 1/(d + 2), and the smaller solution a is ``beside``.
+# Each of the d + 1 points has the same weight, one barycentric coordinate 1 − d·a, and d coordinates a. The rule is
+# exact for polynomials of degree two if the product of two different coordinates has the mean 1/((d + 1)(d + 2)) over
+# the points. Then 2a(1 − d·a) + (d − 1)a² = 1/(d + 2), and the smaller solution a is ``beside``.
 def _linear_rule(d: int) -> tuple[Float[np.ndarray, "q n"], Float[np.ndarray, " q"]]:
     """Return the barycentric coordinates and weights of a rule that is exact for degree two."""
     beside = (d + 2 - math.sqrt(d + 2)) / ((d + 1) * (d + 2))
@@ -82,8 +82,8 @@ def _linear_rule(d: int) -> tuple[Float[np.ndarray, "q n"], Float[np.ndarray, " 
     return points, np.full(d + 1, 1 / math.factorial(d + 1))
 
 
-# Radon's rule has 7 points in a triangle, and Keast's has 15 points in a tetrahedron: the centre, an orbit near the
-# corners, an orbit near the centres of the sides and, in 3D, an orbit near the midpoints of the edges.
+# Radon's rule has 7 points in a triangle, and Keast's has 15 points in a tetrahedron: the centre, one point near each
+# corner, one near the centre of each side and, in 3D, one near the midpoint of each edge.
 def _quadratic_rule(d: int) -> tuple[Float[np.ndarray, "q n"], Float[np.ndarray, " q"]]:
     """Return the barycentric coordinates and weights of a rule that is exact for degree five."""
     root, n = math.sqrt(15), d + 1
@@ -125,21 +125,21 @@ Quadrature = Literal["gauss", "cancelling"]
 MASS = math.sqrt(2 / 3)
 """The coordinate ξ of the points ±ξ on each axis of [−1, 1]^d where the mass evaluates shape functions."""
 _LEAST, _GREATEST = 0.01, 1.0
-"""Bounds of ξ² for the stiffness, so that points are in the cell, but not at its centre, where hourglass modes have no
+"""Bounds of ξ² for the stiffness. They keep points in the cell, but off its centre, where hourglass modes have no
 energy."""
 
 
-# Let the tensor T be constant, A = T⁻¹, hₐ the spacings, k the wave vector of a plane wave, and θₐ = kₐhₐ. With points
-# ±ξ and μ = (1 − ξ²)/4, the mass along one axis has the symbol 1 − μθ² + O(θ⁴). In the stiffness, ∂h∂h' has the symbol
-# k²(1 − θ²/12), and ∂h h' has (sin θ)/h for every ξ. Let the mass have μ, and the stiffness ν along axes
-# without a derivative. Then the eigenvalue λ = Σ Aₐᵦkₐkᵦ becomes, to leading order,
+# Let T be a constant tensor, A = T⁻¹, hₐ the spacing along axis a, k the wave vector of a plane wave, and θₐ = kₐhₐ.
+# For points ±ξ and μ = (1 − ξ²)/4, the mass along one axis has the symbol 1 − μθ² + O(θ⁴). In the stiffness, a product
+# of two derivatives has the symbol k²(1 − θ²/12), and a derivative times a value has (sin θ)/h for every ξ. Let ν be
+# the stiffness's μ for axes without a derivative. To leading order, the eigenvalue λ = Σ Aₐᵦkₐkᵦ becomes
 #
 #     λ + λ μ Σₐ θₐ² − Σₐ Aₐₐkₐ² (θₐ²/12 + ν Σ_{b≠a} θᵦ²) − Σ_{a<b} 2Aₐᵦkₐkᵦ ((θₐ² + θᵦ²)/6 + ν Σ_{c≠a,b} θ_c²).
 #
 # For μ = ν = 1/12 the error −Σ_{a<b} 2Aₐᵦkₐkᵦ (θₐ² + θᵦ²)/12 remains, which is zero for a diagonal tensor. For other
 # tensors, no stencil with 3^d couplings cancels the error for every k. But ν = 1/12 + δ cancels the mean of the error
-# over the heat kernel, in which θ is normal with a covariance proportional to S, where Sₐᵦ = hₐhᵦTₐᵦ. Let A now be the
-# inverse of S. With Isserlis' theorem E θₐθᵦθ_cθ_e = SₐᵦS_ce + Sₐ_cSᵦ_e + Sₐ_eSᵦ_c,
+# over the heat kernel. In this mean, θ is normal with a covariance proportional to Sₐᵦ = hₐhᵦTₐᵦ. Let A now be the
+# inverse of S. Isserlis' theorem E θₐθᵦθ_cθ_e = SₐᵦS_ce + Sₐ_cSᵦ_e + Sₐ_eSᵦ_c gives
 #
 #     δ = −(1/12) Σ_{a<b} 2Aₐᵦ E(θₐ³θᵦ + θₐθᵦ³) / (Σ_{a≠b} Aₐₐ E θₐ²θᵦ² + Σ_{a<b} Σ_{c≠a,b} 2Aₐᵦ E θₐθᵦθ_c²);
 #
@@ -163,13 +163,13 @@ def stiffness_point(metric: Float[Array, "d d"], spacing: Float[np.ndarray | Arr
     return jnp.clip(2 / 3 + numerator / (3 * denominator), _LEAST, _GREATEST)
 
 
-# Only the shape functions are evaluated at these points. The tensors are evaluated at Gauss points, which integrate
-# them accurately: with tensors at the new points, errors on brains were twice as large.
+# Only the shape functions are evaluated at the points ±ξ. Tensors are evaluated at Gauss points, which integrate
+# tensors accurately. With tensors evaluated at the points ±ξ, errors on brains were twice as large.
 #
 # On a cell, a function is a linear combination of products of coordinates, one for each set of axes. The derivative of
 # a product of m coordinates is a product of m − 1 coordinates, which are ±ξ at the points. So the stiffness for points
-# ±ξ is that for Gauss points ±ξ₀ with the derivative of each product multiplied by (ξ/ξ₀)^(m−1). The products are
-# orthogonal, because their values at the corners are ±1.
+# ±ξ follows from the stiffness for Gauss points ±ξ₀, if the derivative of each product is multiplied by (ξ/ξ₀)^(m−1).
+# The products are orthogonal, because their values at the corners are ±1.
 def moved(
     stiffness: Float[Array, "n n"], metric: Float[Array, "q d d"], spacing: Float[np.ndarray | Array, " d"]
 ) -> Float[Array, "n n"]:
@@ -183,7 +183,7 @@ def moved(
 
 @lru_cache(maxsize=2)
 def _products_of_coordinates(dimension: int) -> tuple[Float[np.ndarray, "nn nn"], Float[np.ndarray, " n"]]:
-    """Return the transform of matrices to the basis of products of coordinates and back, and max(m − 1, 0) for each."""
+    """Return the transform of matrices to the basis of products of m coordinates, and max(m − 1, 0) for each one."""
     one = np.array([[1.0, 1.0], [1.0, -1.0]]) / np.sqrt(2)
     basis = reduce(np.kron, [one] * 2 * dimension)
     degrees = np.indices((2,) * dimension).sum(axis=0).ravel()

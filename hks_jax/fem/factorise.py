@@ -31,16 +31,16 @@ def factorise(
 
     The matrix A may be indefinite. All results are differentiable with respect to K, M, σ and right-hand sides, in
     forward and reverse mode to any order, under `jit` and `vmap`. The elimination is a multifrontal LDLᵀ along a nested
-    dissection, without pivoting across fronts. Its accuracy is tested on random right-hand sides. If small pivots make
-    it inaccurate, the elimination is repeated with these pivots replaced, and solutions are refined iteratively. If
-    values are traced, results of a singular matrix are NaN, and ``.sound`` is False.
+    dissection, without pivoting across fronts. The accuracy is tested on random right-hand sides. If small pivots make
+    the elimination inaccurate, it is repeated with larger pivots in their place, and solutions are refined iteratively.
+    If values are traced, results of a singular matrix are NaN, and ``.sound`` is False.
 
     Args:
         domain: a tensor field, a mesh, a pencil, a symmetric sparse matrix K (then M is the identity), or (K, M), as
             for `eigenpairs`.
         shift: the shift σ.
         boundary: see `assemble`; leave it out for a pencil or matrices.
-        mass: likewise.
+        mass: see `assemble`; leave it out for a pencil or matrices.
 
     Raises:
         ValueError: a shift that is not a finite number; a singular matrix (the message has the number of null vectors);
@@ -154,9 +154,9 @@ class _State(eqx.Module):
 class Multifrontal(lx.AbstractLinearSolver[_State]):
     """The factorisation of `factorise` as a solver of lineax, for symmetric and Hermitian operators, definite or not.
 
-    A `SparseLinearOperator`, multiples and sums of these, and real tridiagonal operators are factorised as sparse
-    matrices. All other operators are converted by ``as_matrix`` and take n³ operations; a complex operator takes as
-    many operations as a real operator of twice the size. Derivatives are those of lineax. The matrix must be
+    A `SparseLinearOperator`, multiples and sums of such operators, and real tridiagonal operators are factorised as
+    sparse matrices. All other operators are converted by ``as_matrix`` and take n³ operations; a complex operator takes
+    as many operations as a real operator of twice the size. Lineax defines the derivatives. The matrix must be
     nonsingular.
 
     Examples:
@@ -186,16 +186,16 @@ class Multifrontal(lx.AbstractLinearSolver[_State]):
         return _State(factorised(_full(jnp.block([[real, -imaginary], below])), "operator"), hermitian)
 
     def compute(self, state: _State, vector: Any, options: dict[str, Any]) -> tuple[Any, lx.RESULTS, dict[str, Any]]:
-        """Solve with a factorised operator; if it is singular, the solution is NaN, and lineax reports this."""
+        """Solve with a factorised operator. If the operator is singular, the solution is NaN, which lineax reports."""
         flat, unflatten = ravel_pytree(vector)
         return unflatten(state.solve(flat)), lx.RESULTS.successful, {}
 
     def transpose(self, state: _State, options: dict[str, Any]) -> tuple[_State, dict[str, Any]]:
-        """Return the state of the transpose."""
+        """Return the state of the transposed operator."""
         return (state.conjugated() if state.hermitian else state), options
 
     def conj(self, state: _State, options: dict[str, Any]) -> tuple[_State, dict[str, Any]]:
-        """Return the state of the conjugate."""
+        """Return the state of the conjugate operator."""
         return state.conjugated(), options
 
     def assume_full_rank(self) -> bool:

@@ -1,7 +1,7 @@
 """Weak forms, the integrands of stiffness and mass, and their integrals over one element.
 
 A form is a function of two shape functions u and v and of a point w. It is bilinear and symmetric in u and v, written
-as in scikit-fem, and integrated over the domain with the volume element √|T| dx.
+as in scikit-fem, and integrated with the volume element √|T| dx of the metric T.
 """
 
 from collections.abc import Callable, Mapping
@@ -42,7 +42,7 @@ Form = Callable[[ShapeFunction, ShapeFunction, Point], Array]
 
 
 def laplace_beltrami(u: ShapeFunction, v: ShapeFunction, w: Point) -> Array:
-    """Return the stiffness ρ (T⁻¹∇u·∇v + V u v) of −ρ⁻¹ div(ρ ∇·) + V, with the defaults V = 0 and ρ = 1."""
+    """Return the stiffness's integrand ρ (T⁻¹∇u·∇v + V u v); without a potential V = 0, without a density ρ = 1."""
     energy = u.grad @ w.inverse @ v.grad
     if "potential" in w.fields:
         energy = energy + w["potential"] * u.value * v.value
@@ -50,7 +50,7 @@ def laplace_beltrami(u: ShapeFunction, v: ShapeFunction, w: Point) -> Array:
 
 
 def l2(u: ShapeFunction, v: ShapeFunction, w: Point) -> Array:
-    """Return the mass ρ u·v, whose integral is the inner product of L²."""
+    """Return the integrand ρ u·v of the mass, whose integral is the inner product of L²."""
     return _weighted(jnp.sum(u.value * v.value), w)
 
 
@@ -71,7 +71,7 @@ class WeakForm(NamedTuple):
 
 
 def of_components(functions: ShapeFunction, components: int) -> ShapeFunction:
-    """Return the vector functions (q, n·c, c) that have one of n functions in one component, and 0 in the others."""
+    """Return vector functions (q, n·c, c): one of n given functions in one of c components, and 0 in the others."""
     if components == 1:
         return functions
     (h, dh), eye = functions, jnp.eye(components, dtype=functions.value.dtype)
@@ -81,7 +81,7 @@ def of_components(functions: ShapeFunction, components: int) -> ShapeFunction:
 
 
 # A form is linear in u, so that form(u, v, w) is the inner product of flux(v) with the value and gradient of u. The
-# transpose of the form gives the flux; for T⁻¹∇u·∇v it is T⁻¹∇v. So n evaluations suffice for n² pairs.
+# transpose of the form gives the flux, which is T⁻¹∇v for the form T⁻¹∇u·∇v. So n evaluations suffice for n² pairs.
 def integrate(form: Form, volume: Float[Array, " q"], functions: ShapeFunction, points: Point) -> Float[Array, "n n"]:
     """Integrate a form over one element, for all pairs of n shape functions: value (q, n, *c), grad (q, n, *c, d).
 
@@ -126,7 +126,7 @@ def _name(form: Form) -> str:
 
 
 def symmetric_or_nan(matrices: Float[Array, "*m n n"]) -> Float[Array, "*m n n"]:
-    """Return the matrices, with NaN in place of those that are unsymmetric beyond rounding."""
+    """Return the matrices, with NaN in place of matrices that are unsymmetric beyond rounding."""
     skew = jnp.abs(matrices - jnp.swapaxes(matrices, -1, -2)).max((-2, -1), keepdims=True)
     size = jnp.abs(matrices).max((-2, -1), keepdims=True)
     return jnp.where(skew > ROUNDING * jnp.finfo(matrices.dtype).eps * size, jnp.nan, matrices)

@@ -16,7 +16,7 @@ from hks_jax.traced import is_traced
 
 
 def with_rim(x: Any, periodic: tuple[bool, ...], first: int = 0) -> Any:
-    """Pad x (*shape) by one node at both ends of the axes from ``first`` on: periodically, or by zeros."""
+    """Pad x by one node at both ends of axis ``first`` and the axes after it: periodically, or by zeros."""
     pad = np.pad if isinstance(x, np.ndarray) else jnp.pad
     for axis, wraps in enumerate(periodic, start=first):
         widths = [(1, 1) if a == axis else (0, 0) for a in range(x.ndim)]
@@ -25,7 +25,7 @@ def with_rim(x: Any, periodic: tuple[bool, ...], first: int = 0) -> Any:
 
 
 def neighbours(x: Any, dimension: int) -> Iterator[Any]:
-    """Yield x shifted by each of 3^d offsets along its first d = ``dimension`` axes, along which x is padded."""
+    """Yield x, shifted by each of 3^d offsets along its first d = ``dimension`` axes; x is padded along these axes."""
     after = (0,) * (x.ndim - dimension)
     shape = [n - 2 if axis < dimension else n for axis, n in enumerate(x.shape)]
     for start in product((0, 1, 2), repeat=dimension):
@@ -35,17 +35,15 @@ def neighbours(x: Any, dimension: int) -> Iterator[Any]:
 
 
 def side_by_side(coefficients: Float[Array, "offsets *shape"]) -> Float[Array, " entries"]:
-    """Return the coefficients with those of each node adjacent in memory, which halves the time of a product.
-
-    The result has one axis, because XLA would otherwise choose the memory layout of its axes.
-    """
+    """Return the coefficients in one row, node by node, which halves the time of a product."""
+    # For a result with several axes, XLA could choose another order in memory.
     return jnp.moveaxis(coefficients, 0, -1).reshape(-1)
 
 
 def product_with_rim(
     coefficients: Float[Array, "offsets *shape"],
 ) -> Callable[[Float[Array, "*rimmed b"]], Float[Array, "*shape b"]]:
-    """Return the product of a stencil with columns that are padded by `with_rim`."""
+    """Return the function that multiplies columns, padded by `with_rim`, by a stencil."""
     shape, together = coefficients.shape[1:], side_by_side(coefficients)
 
     def apply(x: Float[Array, "*rimmed b"]) -> Float[Array, "*shape b"]:
@@ -59,7 +57,7 @@ def product_with_rim(
 
 
 def checked_mesh(mesh: Any) -> Mesh:
-    """Return a mesh of devices with one axis. XLA chooses the sharding of arrays for which none is given."""
+    """Return a mesh of devices with one axis; XLA chooses the sharding of arrays whose sharding is not given."""
     if not isinstance(mesh, Mesh) or len(mesh.axis_names) != 1:
         got = f"the axes {mesh.axis_names}" if isinstance(mesh, Mesh) else type(mesh).__name__
         raise ValueError(
@@ -71,7 +69,7 @@ def checked_mesh(mesh: Any) -> Mesh:
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Slabs:
-    """A grid cut across its first axis into slabs of equal thickness, one for each device. Static and hashable.
+    """A grid whose first axis is divided into slabs of equal thickness, one slab for each device; static and hashable.
 
     If the axis does not divide evenly, the last slabs are padded with zeros, which are coupled to no node.
 
@@ -138,7 +136,7 @@ class Slabs:
     def product(
         self, coefficients: Float[Array, "offsets *padded"], x: Float[Array, "*padded b"]
     ) -> Float[Array, "*padded b"]:
-        """Return the product of a stencil's coefficients with columns, both from `split` (axes 1 and 0).
+        """Return the product of a stencil's coefficients, split along axis 1, with columns, split along axis 0.
 
         The product is bilinear and differentiable. Each device sends and receives two planes of the columns.
         """
@@ -185,7 +183,7 @@ class Slabs:
         return with_rim(x, self.periodic[1:], first=1)
 
     def own(self, x: Array, axis: int = 0) -> Array:
-        """Return this device's slab of an array that is whole on every device."""
+        """Return this device's slab of an array that every device holds as a whole."""
         start = jax.lax.axis_index(self.name) * self.thickness
         return jax.lax.dynamic_slice_in_dim(self._padded(x, axis), start, self.thickness, axis=axis)
 

@@ -26,7 +26,7 @@ from hks_jax.fem.space import GridSpace, MeshSpace, cells_of, couplings_for, mas
 from hks_jax.fem.stencil import StencilOperator
 
 _ON_HOST = 1 << 17
-"""The largest number of tensor entries for which NumPy integrates, in milliseconds and without compilation."""
+"""NumPy integrates up to this number of tensor entries, which takes milliseconds and no compilation."""
 
 
 def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace, operator: WeakForm) -> Pencil:
@@ -53,7 +53,7 @@ def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace
 
 
 def grid_points(grid: Grid, space: GridSpace, dtype: Any) -> Float[Array, "*elements q d"]:
-    """Return the positions of the quadrature points; elements outside the domain get the positions of one inside."""
+    """Return the positions of the quadrature points; elements outside the domain get those of an element inside."""
     first = np.argwhere(space.elements)[0].astype(dtype)
     corners = np.array(list(product((0.0, 1.0), repeat=space.dimension)))
     inner = tensor_product_element(space.dimension).values @ corners
@@ -75,7 +75,7 @@ def _points_from(
 
 
 def _numpy_rule(args: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
-    """Return the Laplace–Beltrami integrals, their tangents, or the cotangents of the tensors, by NumPy."""
+    """Compute the Laplace–Beltrami integrals, their tangents, or the cotangents of the tensors, with NumPy."""
     tensors, domain, elements, couplings, gradients, weights, _, _, fields, periodic, interpolation, operator = args
     plain = operator == WeakForm(lumped=operator.lumped) and interpolation == "linear" and not fields
     if not plain or tensors.size > _ON_HOST or (x is not None and len(jax.tree.leaves(x)) > 1):
@@ -143,13 +143,13 @@ def _grid_integrals(
 ) -> tuple[Array, Array, Array, Array]:
     """Return stiffness and mass as stencils, the row sums of the mass at all nodes, and the volume.
 
-    For functions with several components, the element matrices replace the stencils.
+    For functions with several components, return the element matrices in place of stencils.
     """
     element = Element(tensor_product_element(len(periodic)).values, gradients, weights)
     tensors = spd.positive_or_nan(spd.identity_outside(tensors, domain))
 
     # Logarithms are computed at the nodes, and exponentials at the quadrature points. The barriers keep the compiler
-    # from fusing the exponentials into each use of a component, and so from repeating them.
+    # from fusing the exponentials into each use of a component, and so from repeating the exponentials.
     nodal = tensors if interpolation == "linear" else spd.log(tensors)
     at_corners = partial(_at_corners, periodic=periodic)
     at_points = partial(Field.at_points, corners=at_corners, shape_values=element.values, elements=elements.shape)
@@ -258,7 +258,7 @@ def assemble_mesh(
     space: MeshSpace,
     operator: WeakForm,
 ) -> Pencil:
-    """Return the pencil of a mesh; if it is ``curved``, its edges pass through the given midpoints."""
+    """Return the pencil of a mesh; if ``curved``, the edges of the mesh pass through the midpoints among the nodes."""
     element = simplex_element(space.dimension, space.degree)
     shape = len(space.cells), element.weights.size
     if curved:
@@ -278,7 +278,7 @@ def assemble_mesh(
     lumped = volumes = row_sums_of(own, mass)
     if "density" in fields:
         volumes = jnp.sqrt(spd.determinant(metric)) @ element.weights.astype(metric.dtype)
-    # The error of P1 elements is estimated from the lengths of edges. No such estimate is known for P2.
+    # The error of P1 elements is estimated from the lengths of edges. No error estimate is known for P2 elements.
     sampled = SampledMetric(jax.lax.stop_gradient(mesh.metric), None) if space.degree == 1 else None
     return assembled(
         gathered(own, stiffness), gathered(own, mass), lumped, sampled, jnp.sum(volumes), own, operator, fields

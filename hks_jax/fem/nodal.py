@@ -57,7 +57,7 @@ class NodalPencil(eqx.Module):
         return NodalPencil(self.stiffness.own(slabs), self.mass.own(slabs), *masks)
 
     def products(self) -> Callable[[Float[Array, "*shape b"]], tuple[Float[Array, "*shape b"], ...]]:
-        """Return x ↦ (Kx, Mx), which reads neighbours once for both; call this before a loop of products."""
+        """Return the function x ↦ (Kx, Mx), which reads neighbours once for both products; call it outside loops."""
         stiffness, mass = self.stiffness.of_rimmed(), self.mass.of_rimmed()
 
         def both(x: Float[Array, "*shape b"]) -> tuple[Float[Array, "*shape b"], ...]:
@@ -66,13 +66,13 @@ class NodalPencil(eqx.Module):
 
         return both
 
-    # P is p(D⁻¹M)D⁻¹ with a fixed polynomial p, and so linear and symmetric. On the spectrum [low, 1] of D⁻¹M,
-    # |1 − μ p(μ)| ≤ 1/T_m(σ), where σ = (1 + low)/(1 − low). The upper end is 1 by Gershgorin's theorem, since the
-    # entries of M are not negative.
+    # P is p(D⁻¹M)D⁻¹ with a fixed polynomial p of degree m − 1, and so linear and symmetric. If μ is in the spectrum
+    # [low, 1] of D⁻¹M, |1 − μ p(μ)| ≤ 1/T_m(σ), where σ = (1 + low)/(1 − low). The upper end is 1 by Gershgorin's
+    # theorem, since the entries of M are not negative.
     def mass_solve(
         self, low: Float[Array, ""] | float, degree: int
     ) -> Callable[[Float[Array, "*shape b"]], Float[Array, "*shape b"]]:
-        """Return r ↦ Pr, where P ≈ M⁻¹ by ``degree`` steps of Chebyshev iteration; P is exact if M is lumped."""
+        """Return r ↦ Pr, where P ≈ M⁻¹ is ``degree`` steps of Chebyshev iteration, or exactly M⁻¹ if M is lumped."""
         inverse, mass = 1 / self.lumped[..., None], self.mass.of_columns()
         if self.mass.is_diagonal:
             return lambda r: inverse * r
@@ -81,7 +81,7 @@ class NodalPencil(eqx.Module):
 
 
 def lump(stiffness: Stencil, mass: Stencil, free: Bool[Array, "*shape"], domain: Bool[Array, "*shape"]) -> NodalPencil:
-    """Return the pencil of these matrices, together with the row sums of the mass."""
+    """Return the `NodalPencil` of a stiffness and a mass; the row sums of the mass are computed."""
     sums = jnp.where(free, jnp.sum(mass.coefficients, axis=0), 1)
     return NodalPencil(stiffness, mass, jax.lax.stop_gradient(sums), free, domain)
 
@@ -100,8 +100,8 @@ def nodal_pencil(pencil: Pencil) -> NodalPencil:
 
 def to_columns(rows: Float[Array, "b nodes"], shape: tuple[int, ...]) -> Float[Array, "*shape b"]:
     """Return rows of flat nodal arrays as a block of columns."""
-    # The barriers, here and below, keep XLA from fusing the transposition with the products before or after it, which
-    # would then access memory in the wrong order.
+    # The barriers, here and below, keep XLA from fusing the transposition with matrix products, which would then access
+    # memory in the wrong order.
     return jax.lax.optimization_barrier(jnp.moveaxis(rows.reshape(-1, *shape), 0, -1))
 
 
@@ -111,9 +111,9 @@ def to_rows(columns: Float[Array, "*shape b"]) -> Float[Array, "b nodes"]:
 
 
 _FILLED = {2: 0.45, 3: 0.6}
-"""The least fraction of free nodes for `on_all_nodes`, by dimension. In 2D with half of the nodes free, later calls are
-1.4 to 1.9 times slower, and about ten calls lose the time that the first call saves. In 3D the cost of a factorisation
-grows faster."""
+"""The least fraction of free nodes for which `on_all_nodes` uses all nodes, by dimension. If half of the nodes are free
+in 2D, later calls are 1.4 to 1.9 times slower, and about ten calls lose the time that the first call saves. In 3D the
+cost of a factorisation grows faster."""
 
 
 def on_all_nodes(pencil: AnyPencil, k: int = 0) -> AnyPencil:
@@ -145,16 +145,16 @@ def _of_one(pencil: Pencil) -> Pencil:
         vectors = space.extend(nulls.vectors, outside=0.0)
         nulls = NullSpace(vectors.reshape(len(vectors), whole.n_dof), nulls.fixed)
     sums = pencil.row_sums
-    if sums is not None:  # an infinite sum ignores the neighbours
+    if sums is not None:  # with an infinite row sum, `read` ignores the neighbours
         sums = jnp.where(space.free, space.extend(sums, outside=0.0), jnp.inf).ravel()
     stiffness = StencilOperator(of_stiffness, whole)
     return replace(pencil, stiffness=stiffness, mass=mass, space=whole, null_space=nulls, row_sums=sums)
 
 
 # The largest Kᵢᵢ/Mᵢᵢ is a Rayleigh quotient and so at most the largest eigenvalue: the spectrum does not become wider.
-# It exceeds the lowest quarter of the spectrum: on a uniform grid with the consistent mass it is 6/h² in 2D and 9/h² in
-# 3D, and that quarter ends at 3.8/h² and 7.6/h². With a lumped mass it is 2.7/h², and the quarter ends at 2.2/h² and
-# 2.4/h². Because this margin is small, the quotient is doubled; the spectrum then ends at 5.3/h² instead of 4/h².
+# The quotient exceeds the lowest quarter of the spectrum. On a uniform grid with consistent mass, it is 6/h² in 2D and
+# 9/h² in 3D, and the quarter ends at 3.8/h² and 7.6/h². For lumped mass it is 2.7/h², and the quarter ends at 2.2/h²
+# and 2.4/h². Because this margin is small, the quotient is doubled; the spectrum then ends at 5.3/h², not 4/h².
 @jax.jit
 def _with_others(
     stiffness: Float[Array, "offsets *shape"], mass: Float[Array, "m *shape"], free: Bool[np.ndarray | Array, "*shape"]

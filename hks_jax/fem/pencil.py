@@ -21,16 +21,16 @@ from hks_jax.traced import is_staged
 
 
 class Pencil(SymmetricPencil):
-    """The stiffness K and the mass M ≻ 0 of functions on a domain, or a pair of matrices from elsewhere.
+    """The stiffness K and the positive definite mass M of functions on a domain, or a pair of the user's matrices.
 
     Attributes:
         stiffness: K; multiply with ``@``, or convert with ``.to_scipy()`` or ``.to_dense()``.
-        mass: M, likewise.
+        mass: M, with the same methods.
         metric: the metric of the domain, for error estimates; None if it is not known.
         volume: the area or volume of the domain in the units of the metric, including eliminated nodes; None if it is
             not known.
         space: the space of the functions.
-        null_space: the null space of K ⪰ 0; None if it is not known, in which case K may be indefinite.
+        null_space: the null space of a positive semidefinite K; None if it is not known, and then K may be indefinite.
         lower_bound: a lower bound of the spectrum, if one is known for a K that may be indefinite; derivatives treat it
             as constant.
         row_sums: (n_dof,) the row sums of M, including eliminated columns, from which `read` computes nodal values;
@@ -70,13 +70,13 @@ class Pencil(SymmetricPencil):
         return functions if self.row_sums is None else _read(self.mass, self.row_sums, functions)
 
     def integrals(self, values: Float[Array, "... n_dof"]) -> Float[Array, "... n_dof"]:
-        """Return weights w with ∫φu = w·φ, where φ has nodal values from `read`, and u has the nodal ``values``."""
+        """Return weights w with w·φ = ∫φu, where φ are nodal values from `read`, and u has the nodal ``values``."""
         if self.row_sums is None:
             return self.mass.apply(values)
         return jnp.where(jnp.isinf(self.row_sums), 0, self.row_sums) * values
 
     def with_stiffness(self, stiffness: PatternedOperator) -> "Pencil":
-        """Return the pencil with another stiffness on the same domain, such as K + V; its null space is not known.
+        """Return the pencil with another stiffness, such as K + V, on the same domain; the null space is then unknown.
 
         ``pencil.with_stiffness(pencil.stiffness.plus(V))`` with V (n_dof,) adds a diagonal matrix.
 
@@ -91,7 +91,7 @@ class Pencil(SymmetricPencil):
         return replace(self, stiffness=stiffness, null_space=None, lower_bound=None)
 
     def counted_from(self, origin: Float[Array, ""]) -> "Pencil":
-        """Return the pencil of K − σM and M, where σ is a lower bound of the spectrum, without null vectors."""
+        """Return the pencil of K − σM and M without null vectors, where σ is a lower bound of the spectrum."""
         moved = self.stiffness.with_flat(self.shifted(origin))
         nothing = NullSpace(jnp.zeros((0, self.size), origin.dtype))
         return replace(self, stiffness=moved, null_space=nothing, lower_bound=None, row_sums=None)
@@ -118,7 +118,7 @@ class MirrorPencil(eqx.Module):
         parts: the mixed problems; the first has Neumann conditions wherever the domain is doubled.
         including: for each part, the earlier parts whose function space includes its own, and the part itself. By the
             min–max principle, eigenvalue i of a part is not less than eigenvalue i of a part that includes it. So a
-            part that c parts include has at most the fraction 1/c of the lowest eigenvalues of all parts.
+            part that c parts include has at most the fraction 1/c of the lowest eigenvalues of the doubled domain.
     """
 
     parts: tuple[Pencil, ...]
@@ -141,7 +141,8 @@ class MirrorPencil(eqx.Module):
 
     def read(self, functions: Float[Array, "k n_dof"], part: Int[Array, " k"] | None) -> Float[Array, "k n_dof"]:
         """Return the values of functions at the free nodes, given their unknowns and each function's part."""
-        # At the free nodes of a part, its mass equals the mass of the first part; at other nodes its functions vanish.
+        # At the free nodes of a part, its mass equals the first part's mass; at other nodes the part's functions
+        # vanish.
         sums = [
             jnp.where(part.space.free, part.space.extend(part.row_sums, outside=0.0), jnp.inf)
             for part in self.parts
@@ -181,7 +182,7 @@ def assembled(
     operator: WeakForm,
     fields: dict[str, Field],
 ) -> Pencil:
-    """Return the pencil of K and M with its known properties; ``lumped`` has the row sums of M at all nodes."""
+    """Return the pencil of K and M and its known properties; ``lumped`` has the row sums of M at all nodes."""
     mass = DiagonalOperator(entries=space.restrict(lumped)) if operator.lumped else consistent
     if operator.own:
         return Pencil(stiffness, mass, None, None, space)
@@ -194,8 +195,8 @@ def assembled(
     return Pencil(stiffness, mass, metric, volume, space, null_space=nulls, lower_bound=bound, row_sums=sums)
 
 
-# K = A + ∫ρV hᵢhⱼ with A ⪰ 0. If V ≥ v at the quadrature points, then K − vM ⪰ 0 for the mass from the same points. The
-# lumped mass D ⪰ M is larger, so that K − vD ⪰ 0 only for v ≤ 0.
+# With a potential V and a density ρ, K = A + ∫ρV hᵢhⱼ, where A ⪰ 0. If V ≥ v at the quadrature points, K − vM ⪰ 0 for
+# the mass M from the same points. The lumped mass D ⪰ M is larger, so that K − vD ⪰ 0 is certain only for v ≤ 0.
 def _least(potential: Field, space: FunctionSpace, operator: WeakForm) -> Float[Array, ""] | None:
     """Return a lower bound of the spectrum; None if interpolated values may be less than the nodal values."""
     if potential.at == "nodes" and isinstance(space, MeshSpace) and space.degree == 2:

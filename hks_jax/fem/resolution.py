@@ -1,4 +1,4 @@
-"""The resolution of a metric by a grid or a mesh: nodal quantities for estimates of the discretisation error."""
+"""How well a grid or a mesh resolves a metric: nodal quantities for estimates of the discretisation error."""
 
 from itertools import combinations
 from typing import Any
@@ -24,10 +24,10 @@ class SampledMetric(eqx.Module):
 
 
 class Resolution(eqx.Module):
-    """The effect of the spacing on heat kernel signatures to leading order (see `truncation`); not differentiated."""
+    """The effect of the spacing on signatures to leading order (see `truncation`); derivatives treat it as constant."""
 
     mesh_width: Float[Array, "*shape"]  # the distance between neighbouring nodes in the units of the metric
-    dispersion: Float[Array, "*shape"]  # a in the relative bias (a/t)^order for constant tensors, in (metric length)²
+    dispersion: Float[Array, "*shape"]  # a, in (metric length)², if constant tensors have the relative bias (a/t)^order
     turning: Float[Array, "*shape"]  # the relative error of eigenvalues from tensors that rotate or stretch
     swelling: Float[Array, ""]  # the relative error of the domain's area or volume
     order: int = eqx.field(static=True, default=1, kw_only=True)  # 2 if the leading error cancels, else 1
@@ -45,13 +45,13 @@ def resolution_of(metric: SampledMetric, space: FunctionSpace, lumped: bool, can
 
 
 # If tensors are nearly constant, a plane wave with wave vector k has the discrete eigenvalue λ(1 + δ), where λδ =
-# Σₐ hₐ² g^aa kₐ⁴/12. With the consistent mass, its squared nodal values are too large by the factor 1 + Σₐ hₐ²kₐ²/6. In
-# the signature, k is normal with covariance g/2t: E kₐ² = gₐₐ/2t and E kₐ⁴ = 3gₐₐ²/4t². So its relative error is
+# Σₐ hₐ² g^aa kₐ⁴/12. With the consistent mass, squared nodal values are too large by the factor 1 + Σₐ hₐ²kₐ²/6. In the
+# signature, k is normal with covariance g/2t: E kₐ² = gₐₐ/2t and E kₐ⁴ = 3gₐₐ²/4t². Its relative error is
 #
 #     −t E λδ + E Σₐ hₐ²kₐ²/6 = Σₐ hₐ² (gₐₐ/12 − g^aa gₐₐ²/16)/t.
 #
-# A lumped mass divides λ and the square by 1 + Σₐ hₐ²kₐ²/6. By E λkₐ² = (d + 2)gₐₐ/4t² this adds d/24 Σₐ hₐ²gₐₐ/t. The
-# code has 1/20 in place of 1/24, which includes the next terms at t = 6h².
+# A lumped mass divides λ and the squared nodal values by 1 + Σₐ hₐ²kₐ²/6. By E λkₐ² = (d + 2)gₐₐ/4t² this division adds
+# d/24 Σₐ hₐ²gₐₐ/t to the error. The code has 1/20 in place of 1/24, which includes the next terms at t = 6h².
 #
 # If the leading error cancels (hks_jax/fem/elements.py) and the tensor is diagonal, λδ = −Σₐ hₐ⁴ g^aa kₐ⁶/240, and the
 # squared nodal values have the factor 1 + (Σₐ hₐ²kₐ²)²/576. With E kₐ⁶ = 15gₐₐ³/8t³ the relative error is
@@ -60,7 +60,7 @@ def resolution_of(metric: SampledMetric, space: FunctionSpace, lumped: bool, can
 #
 # For tensors that are not diagonal, the error is half to twice as large.
 def _dispersion(xp: Any, tensors: Any, spacing: Any, lumped: bool, cancelling: bool) -> Any:
-    """Return `Resolution.dispersion` (*shape) of Q1 elements."""
+    """Return `Resolution.dispersion` for Q1 elements."""
     inverse, d = spd.inverse(tensors), tensors.shape[-1]
     if cancelling:
         scaled = tensors * spacing[:, None] * spacing
@@ -75,11 +75,11 @@ def _dispersion(xp: Any, tensors: Any, spacing: Any, lumped: bool, cancelling: b
     return total
 
 
-# Between neighbours along axis a, the flux matrix A = √|T| T⁻¹ changes by δA, and an element uses the mean of A. The
-# exact solution u = p·x + w has a corrector w with ∂ₐ(Aₐₐ∂ₐw) = −(∂ₐA eₐ)·p. An element lacks the energy of the
-# corrector, Aₐₐ(∂ₐ²w)² hₐ²/12. If p has the covariance A⁻¹, this energy is δAeₐ·A⁻¹δAeₐ/12Aₐₐ, relative to the energy
-# of p along one axis. The estimate holds for √t above the length on which A varies; for smaller t only its order of
-# magnitude is right.
+# Between neighbours along axis a, the flux matrix A = √|T| T⁻¹ changes by δA, and an element uses the mean of A. Let eₐ
+# be the unit vector along axis a. The exact solution u = p·x + w has a corrector w with ∂ₐ(Aₐₐ∂ₐw) = −(∂ₐA eₐ)·p. The
+# energy of an element does not include the energy of the corrector, Aₐₐ(∂ₐ²w)² hₐ²/12. If p has the covariance A⁻¹, the
+# missing energy is δAeₐ·A⁻¹δAeₐ/12Aₐₐ, relative to the energy of p along one axis. The estimate holds for √t above the
+# length on which A varies; for smaller t only its order of magnitude is right.
 def _turning(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...]) -> Any:
     """Return the relative error (*shape) of eigenvalues due to the variation of tensors between neighbours."""
     root = xp.sqrt(spd.determinant(tensors))[..., None, None]
@@ -97,8 +97,8 @@ def _turning(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...]) -> 
 
 
 # At distance ξ from a node along axis a, the interpolation error is −ξ(h − ξ)/2 times the second derivative. The mean
-# of this factor is −h²/12. The relative error of the density √|T| is half the trace of T⁻¹ times the error of T. This
-# gives tr T⁻¹∂ₐ²T if T is interpolated, and ∂ₐ²log|T| if its logarithm is interpolated.
+# of this factor is −h²/12. The relative error of the density √|T| is half the trace of T⁻¹ times the error of T. So
+# this error is proportional to tr T⁻¹∂ₐ²T if T is interpolated, and to ∂ₐ²log|T| if log T is interpolated.
 def _swelling(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...], interpolation: Interpolation) -> Any:
     """Return the relative error of the domain's volume due to the interpolation between the nodes."""
     determinant, inverse = spd.determinant(tensors), spd.inverse(tensors)
@@ -147,11 +147,10 @@ def _of_grid(
 
 
 _BIAS = (0.03, 0.22)
-"""The constant c in the relative bias c·h²/t of P1 elements with consistent and lumped mass; h is the longest edge.
+"""The constant c in the relative bias c·h²/t of P1 elements, for consistent and lumped mass; h is the longest edge.
 
-The medians of c over the nodes of regular and perturbed meshes of squares, spheres, boxes and balls were 0.008 … 0.028
-and 0.03 … 0.14.
-"""
+On regular and perturbed meshes of squares, spheres, boxes and balls, the median of c over the nodes was 0.008 … 0.028
+for consistent and 0.03 … 0.14 for lumped mass."""
 
 
 @jit_quickly(static_argnames=("n_vertices", "lumped"))

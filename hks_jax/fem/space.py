@@ -1,4 +1,4 @@
-"""Finite element spaces: their degrees of freedom, their null vectors, and masks for computations."""
+"""Finite element spaces, their degrees of freedom and null vectors, and masks as arrays for computations."""
 
 import math
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ class FunctionSpace(ByKey):
     free: Bool[np.ndarray, "*node_shape"]  # the nodes that carry a degree of freedom; Dirichlet nodes are not free
     boundary: tuple[Sides, ...]  # the conditions of each axis and of the rim of a mask; for a mesh one pair
     n_components: int  # the number of connected components of the domain
-    elements: Bool[np.ndarray, "*elements"]  # n − 1 along each axis of a grid (n if periodic), or all cells of a mesh
+    elements: Bool[np.ndarray, "*elements"]  # the elements in the domain; a grid axis has n − 1 or, if periodic, n
     _labels: Int[np.ndarray, "*node_shape"]
 
     def __repr__(self) -> str:
@@ -65,7 +65,7 @@ class FunctionSpace(ByKey):
 
     @cached_property
     def null_labels(self) -> Int[np.ndarray, " n_dof"]:
-        """The number 0 … n_null − 1 of each degree of freedom's constant null vector, or −1.
+        """The number 0 … n_null − 1 of the null vector that is 1 at each degree of freedom, or −1 if all are 0 there.
 
         The stiffness annihilates the constant on each connected component that has no Dirichlet node.
         """
@@ -105,7 +105,7 @@ def _reshaped(xp: Any, values: Any, shape: tuple[int, ...]) -> Any:
     return xp.reshape(values, shape)
 
 
-# The indices are arguments, so that sets of equally many indices share one compilation.
+# The indices are arguments, so that index arrays of equal length share one compilation.
 @numpy_where_known(most=_COPIED)
 def taken(xp: Any, values: Any, indices: Any) -> Any:
     """Return the values (…, m) at given indices of the last axis."""
@@ -126,7 +126,7 @@ def _spread(xp: Any, values: Any, indices: Any, fill: Any) -> Any:
 class GridSpace(FunctionSpace):
     """The Q1 space on a grid with given boundary conditions, as returned by `normalise_boundary`.
 
-    Spacing and origin of the grid are not part of the space, so that they can change without recompilation.
+    The space does not contain the grid's spacing and origin, which can change without recompilation.
     """
 
     def __init__(self, grid: Grid, boundary: tuple[Sides, ...]) -> None:
@@ -235,22 +235,22 @@ vector_space = lru_cache(maxsize=32)(VectorSpace)
 
 
 def axis_colours(n: int, spacing: int, wraps: bool) -> Int[np.ndarray, " n"]:
-    """Return colours along one axis: nodes of one colour are at least ``spacing`` nodes apart."""
+    """Return the colours of the nodes along one axis; nodes of the same colour are at least ``spacing`` nodes apart."""
     if not wraps:
         return np.arange(n) % min(spacing, n)
-    # The axis is split into as many runs of at least `spacing` nodes as fit. A colour is a position in the run.
+    # The axis is split into as many runs of at least `spacing` nodes as fit. A node's colour is its place in the run.
     runs = max(n // spacing, 1)
     return np.concatenate([np.arange(len(run)) for run in np.array_split(np.arange(n), runs)])
 
 
 def mask_for(values: Any, mask: Bool[np.ndarray, "*shape"]) -> Bool[np.ndarray | Array, "*shape"]:
-    """Return the mask as an array of NumPy or, for a compiled computation with ``values``, of JAX."""
+    """Return the mask, as a JAX array if it is an outer product over axes and ``values`` are traced under `jit`."""
     axes = _box(mask) if is_traced(values) and is_staged() else None
     return mask if axes is None else _outer([axis[None] for axis in axes])[0]
 
 
 def couplings_for(values: Any, space: GridSpace) -> Bool[np.ndarray | Array, "offsets *shape"] | None:
-    """Return, for each offset and node, whether both coupled nodes are free, for a computation with ``values``.
+    """Return, for each offset and node, whether both coupled nodes are free; ``values`` take part in the computation.
 
     The result is None if the values are traced and all nodes of the domain are free.
     """
@@ -273,7 +273,7 @@ def _coupled(free: Bool[np.ndarray, "*shape"], periodic: tuple[bool, ...]) -> Bo
 
 
 def _box(mask: Bool[np.ndarray, "*shape"]) -> list[Bool[np.ndarray, " _n"]] | None:
-    """Return one mask per axis, such that their outer product is the given mask; None if there are no such masks."""
+    """Return one mask per axis whose outer product is the given mask; None if no such masks exist."""
     d = mask.ndim
     axes = [np.asarray(mask.any(axis=tuple(a for a in range(d) if a != axis))) for axis in range(d)]
     return axes if mask[np.ix_(*axes)].all() else None
@@ -285,7 +285,7 @@ def _outer(axes: Sequence[Bool[np.ndarray, "_m _n"]]) -> Bool[Array, "ms *ns"]:
     whole = tuple(map(int, shapes.ravel()))
     result = jnp.ones((), bool)
     if not all(axis.all() for axis in axes):
-        # The barrier keeps the compiler from computing the product during compilation.
+        # The barrier keeps the compiler from computing the outer product during compilation.
         known = jax.lax.optimization_barrier([jnp.asarray(axis) for axis in axes])
         places = [tuple(n if i % d == axis else 1 for i, n in enumerate(whole)) for axis in range(d)]
         result = reduce(jnp.logical_and, [axis.reshape(place) for axis, place in zip(known, places, strict=True)])

@@ -28,7 +28,7 @@ from hks_jax.linear.pencil import NullSpace, SymmetricPencil
 from hks_jax.traced import is_traced
 
 _FEW = 8
-"""The number of null vectors up to which each vector is checked."""
+"""The largest number of null vectors of which every vector is checked."""
 
 
 class _Entries(NamedTuple):
@@ -49,14 +49,15 @@ def sparse_pencil(
     volume: Any = None,
     shape: tuple[int, ...] | None = None,
 ) -> Pencil:
-    """Return the pencil of two matrices, with one sparsity pattern: the union of their patterns and the transposes.
+    """Return the pencil of two matrices, whose pattern becomes the union of both patterns and their transposes.
 
-    Both matrices are replaced by their symmetric parts, also in derivatives. All signatures can be computed from the
-    eigenpairs of the pencil. A signature that needs a geometry raises an error that names the missing argument.
+    Both matrices, and their tangents in derivatives, are replaced by their symmetric parts. All signatures can be
+    computed from the eigenpairs. A signature that needs a missing ``dimension`` or ``volume`` raises ValueError.
 
     Args:
         K: a symmetric matrix (n, n): a SciPy sparse matrix, a BCOO or BCSR of `jax.experimental.sparse` (whose data
-            may be traced, but not its indices), an operator of this package, or a full array; or a pencil, without M.
+            may be traced, but not its indices), an operator of this package, or a full array; or a pencil, which
+            includes M.
         M: a symmetric positive definite matrix of the same kinds, or its diagonal (n,); None is the identity. Its
             pattern may differ from that of K.
         null_vectors: (m, n) a basis of the whole null space of K ⪰ 0, where m may be 0. None if it is not known; then K
@@ -68,7 +69,7 @@ def sparse_pencil(
     Raises:
         ValueError: matrices that are not square, differ in size, are complex, NaN, infinite or unsymmetric (the message
             has the entry); a diagonal M with an entry that is not positive; traced indices; null vectors that are
-            linearly dependent, or that K does not annihilate (with the residual); another dimension, volume or shape.
+            linearly dependent, or that K does not annihilate (with the residual); a bad dimension, volume or shape.
 
     Examples:
         >>> K = np.array([[1.0, -1.0, 0.0], [-1.0, 2.0, -1.0], [0.0, -1.0, 1.0]])  # a path of three nodes
@@ -135,10 +136,7 @@ def _checked_null_vectors(pencil: SymmetricPencil, null_vectors: Any) -> Float[A
 
 
 def require_null_space(pencil: SymmetricPencil) -> None:
-    """Raise ValueError if the stiffness does not annihilate the null space of its pencil.
-
-    Traced values are not checked.
-    """
+    """Raise ValueError unless the stiffness annihilates the pencil's null space; traced values are not checked."""
     if pencil.null_space is None or is_traced(pencil) or not pencil.n_null:
         return
     # The check uses NumPy, which needs no compilation.
@@ -152,7 +150,7 @@ def require_null_space(pencil: SymmetricPencil) -> None:
 
     vectors = np.asarray(pencil.null_space.vectors)
     lengths = np.abs(vectors).max(axis=1, keepdims=True)
-    # Of many vectors, only a random linear combination is checked.
+    # If there are many vectors, only a random linear combination of all vectors is checked.
     weights = np.random.default_rng(0).standard_normal(len(vectors))
     some = vectors if len(vectors) <= _FEW else [weights @ (vectors / np.where(lengths > 0, lengths, 1))]
     if max(map(defect, some)) > ROUNDING * finfo.eps:
@@ -206,7 +204,7 @@ def _pencil(K: Any, M: Any) -> SymmetricPencil:
 
 
 def _entries(name: str, matrix: Any) -> _Entries:
-    """Return the entries of a square matrix; check its symmetry unless they are traced."""
+    """Return the entries of a square matrix; check the symmetry of the matrix unless the entries are traced."""
     if isinstance(matrix, BCSR):
         matrix = matrix.to_bcoo()
     if isinstance(matrix, BCOO):
@@ -216,7 +214,7 @@ def _entries(name: str, matrix: Any) -> _Entries:
         entries = _Entries(values, rows, cols, matrix.size)
     elif issparse(matrix):
         _check_square(name, matrix.shape)
-        held = matrix.tocsr().tocoo()  # adds entries at equal places
+        held = matrix.tocsr().tocoo()  # entries in the same place are added
         entries = _Entries(real_array(name, held.data), held.row, held.col, held.shape[0])
     else:
         array = real_array(name, matrix)
@@ -247,7 +245,7 @@ def _of_bcoo(name: str, matrix: BCOO) -> _Entries:
 
 
 def _diagonal(M: Any, n: int, dtype: np.dtype) -> Array | None:
-    """Return the diagonal of a mass that is given by its diagonal or is the identity; otherwise None."""
+    """Return the diagonal of a mass that is given by its diagonal or by None, the identity; otherwise return None."""
     if M is None:
         return jnp.ones(n, dtype)
     if isinstance(M, DiagonalOperator):

@@ -1,4 +1,4 @@
-"""Matrices on grids: stencils on nodal arrays and on degrees of freedom, their sparsity pattern and bisection."""
+"""Matrices on grids: stencils on nodal arrays or on degrees of freedom, their sparsity pattern and bisection."""
 
 import math
 from collections.abc import Callable
@@ -22,7 +22,7 @@ from hks_jax.linear.pattern import Pattern
 from hks_jax.linear.products import of_each_row
 
 _CELL = {2: 25, 3: 64}
-"""The largest number of nodes of a cell that is not divided: smaller cells need fewer operations, but more batches."""
+"""The largest number of nodes of a part that is not bisected. Smaller parts need fewer operations, but more batches."""
 
 
 @jax.tree_util.register_static
@@ -42,7 +42,7 @@ class GridPattern(ByKey, Pattern):
         return 3**self.space.dimension // 2 * self.space.free.size + np.flatnonzero(self.space.free)
 
     def bisect(self) -> Parts:
-        """Bisect recursively by one or two lines of nodes (a plane in 3D), at the median of the longest side."""
+        """Cut parts recursively at the median of their longest side, by one or two lines of nodes (in 3D, a plane)."""
         x = np.stack(np.nonzero(self.space.free)).astype(np.int32)
         d, n = x.shape
         level, part, left, q = np.zeros(n, np.int8), np.zeros(n, int), np.arange(n), np.zeros(n, int)
@@ -72,7 +72,7 @@ class GridPattern(ByKey, Pattern):
             if d == 2:  # with an even number of lines, two cut lines leave equal halves, and so batches without padding
                 even = (highest - lowest) % 2 == 1
                 separates |= (beyond == -1) & even[q]
-            if depth == 0:  # also cut at node 0, so that the parts are not periodic
+            if depth == 0:  # also cut periodic axes at node 0, so that the parts are not periodic
                 separates |= np.any(x[list(self.space.periodic)] == 0, axis=0)
             cutting, stays = np.flatnonzero(separates), np.flatnonzero(~separates)
             level[left[cutting]], part[left[cutting]] = depth, q[cutting]
@@ -97,11 +97,11 @@ def _couplings(space: GridSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 class Stencil(eqx.Module):
     """A matrix that couples each node of a grid to its 3^d neighbours, applied to blocks of nodal columns (*shape, b).
 
-    In this layout a product reads each coefficient once for all columns, which in 3D is about twice as fast as one row
-    at a time. Stencils of one shape share compiled code, even if their masks differ.
+    In this layout a product reads each coefficient once for all columns. In 3D this is about twice as fast as products
+    with single rows. Stencils of the same shape share compiled code, even if their masks differ.
 
     The offsets o of the coefficients are in the order of ``product((-1, 0, 1), repeat=d)``: entry (o, i) couples node i
-    to node i + o. A diagonal is (1, *shape). Couplings across non-periodic sides are 0.
+    to node i + o. A diagonal matrix has coefficients (1, *shape). Couplings across non-periodic sides are 0.
     """
 
     coefficients: Float[Array, "offsets *shape"]
@@ -118,19 +118,19 @@ class Stencil(eqx.Module):
         return Stencil(slabs.own(self.coefficients, 1), self.periodic, slabs)
 
     def __matmul__(self, x: Float[Array, "*shape b"]) -> Float[Array, "*shape b"]:
-        """Return one product; for products in a loop, see `of_columns`."""
+        """Return the product with columns; for products in a loop, see `of_columns`."""
         return self.of_columns()(x)
 
     def of_columns(self) -> Callable[[Float[Array, "*shape b"]], Float[Array, "*shape b"]]:
         """Return the function that multiplies columns by the matrix.
 
-        For products in a loop, call this before the loop, because it rearranges the coefficients.
+        Call this method before a loop of products, because it rearranges the coefficients.
         """
         apply = self.of_rimmed()
         return (lambda x: apply(x, x)) if self.is_diagonal else (lambda x: apply(x, self.rimmed(x)))
 
     def rimmed(self, x: Float[Array, "*shape b"]) -> Float[Array, "..."]:
-        """Return columns that are padded by the nodes beyond the sides, as `of_rimmed` requires."""
+        """Pad columns by the nodes beyond the sides, as the function that `of_rimmed` returns requires."""
         if self.slabs is not None:
             return self.slabs.with_halo(x)
         if any(self.periodic):
@@ -139,18 +139,18 @@ class Stencil(eqx.Module):
         return jnp.pad(x.reshape(-1, x.shape[-1]), ((reach, reach), (0, 0)))
 
     def of_rimmed(self) -> Callable[[Float[Array, "*shape b"], Float[Array, "..."]], Float[Array, "*shape b"]]:
-        """Return the product as a function of columns x and of `rimmed` x, which several stencils can share."""
+        """Return the product as a function of columns x and ``rimmed(x)``, which several stencils can share."""
         if self.is_diagonal:
             return lambda x, _: self.coefficients[0][..., None] * x
         if self.slabs is not None or any(self.periodic):
             of_box = product_with_rim(self.coefficients)
             return lambda _, rimmed: of_box(rimmed)
-        # If the nodes are numbered in one row, each neighbour is at a fixed distance. Where the row continues beyond a
-        # side, the coefficients are zero, since no element couples these nodes.
+        # If the nodes are numbered in one row, each neighbour is at a fixed distance in this row. Where the row
+        # continues beyond a side, the coefficients are zero, since no element couples the two nodes.
         distances, reach = _distances(self.coefficients.shape[1:])
         row = side_by_side(self.coefficients).reshape(-1, len(distances))
         nodes = len(row)
-        # Accelerators use one array per offset. Without the barrier, XLA would split the array for each product.
+        # Accelerators use one array per offset. Without the barrier, XLA would split the array again for each product.
         apart = jax.lax.optimization_barrier(jnp.split(row, len(distances), axis=1)) if accelerators.at_hand() else ()
 
         def of_row(x: Float[Array, "*shape b"], padded: Float[Array, "padded b"]) -> Float[Array, "*shape b"]:
@@ -170,14 +170,14 @@ class Stencil(eqx.Module):
 
 
 def _distances(shape: tuple[int, ...]) -> tuple[list[int], int]:
-    """Return the distance of each neighbour if the nodes are numbered in one row, and the largest distance."""
+    """Number the nodes in one row; return the distance of each neighbour in this row, and the largest distance."""
     strides = [math.prod(shape[axis + 1 :]) for axis in range(len(shape))]
     distances = [sum(map(mul, offset, strides)) for offset in product((-1, 0, 1), repeat=len(shape))]
     return distances, distances[-1]
 
 
 def coefficients_of(operator: Operator, space: GridSpace) -> Float[Array, "offsets *shape"]:
-    """Return the stencil coefficients of a grid's matrix, (1, *shape) if it is diagonal."""
+    """Return the stencil coefficients of a grid's matrix, which are (1, *shape) for a diagonal matrix."""
     if isinstance(operator, DiagonalOperator):
         return space.extend(operator.entries, outside=0.0)[None]
     assert isinstance(operator, StencilOperator)
@@ -185,10 +185,7 @@ def coefficients_of(operator: Operator, space: GridSpace) -> Float[Array, "offse
 
 
 class StencilOperator(PatternedOperator):
-    """A stencil on the free nodes of a grid, with 9 coefficients per node in 2D and 27 in 3D.
-
-    The coefficients are those of a `Stencil`. Couplings to nodes that are not free are zero.
-    """
+    """A stencil on the free nodes of a grid; couplings to nodes that are not free are zero."""
 
     coefficients: Float[Array, "offsets *shape"]
     space: GridSpace = eqx.field(static=True)
@@ -211,7 +208,7 @@ class StencilOperator(PatternedOperator):
         shape, coefficients = self.space.node_shape, list(self.coefficients)
 
         def product_with(row: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-            # With the barrier, the neighbours are slices of an array. Otherwise XLA would compute the padding per node.
+            # With the barrier, the neighbours are slices of one padded array. Without it, XLA would pad for each node.
             rimmed = jax.lax.optimization_barrier(with_rim(row, self.space.periodic))
             terms = zip(coefficients, neighbours(rimmed, len(shape)), strict=True)
             return reduce(add, (c * shifted for c, shifted in terms))
@@ -220,13 +217,13 @@ class StencilOperator(PatternedOperator):
         return self.space.restrict(of_each_row(product_with, rows).reshape(*x.shape[:-1], *shape))
 
     def of_columns(self) -> OfColumns:
-        """Return the function that multiplies a block of columns, which is twice as fast as with rows."""
+        """Return the function that multiplies a block of columns, which is twice as fast as to multiply rows."""
         shape = self.space.node_shape
         product_with = Stencil(self.coefficients, self.space.periodic).of_columns()
         free, numbers = np.flatnonzero(self.space.free), self.space.degrees_of_freedom
         if free.size == numbers.size:
             return lambda x: product_with(x.reshape(*shape, -1)).reshape(x.shape)
-        numbers = np.where(numbers < 0, free.size, numbers)  # out of range if there is none
+        numbers = np.where(numbers < 0, free.size, numbers)  # out of range at nodes that are not free
 
         def product_of_free(x: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
             nodal = x.at[numbers].get(mode="fill", fill_value=0)

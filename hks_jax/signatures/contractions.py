@@ -19,11 +19,11 @@ from hks_jax.signatures.filters import Filter, mixing
 
 _matmul = partial(jnp.matmul, precision="highest")
 _ON_HOST = 1 << 22
-"""The largest number of entries, of the eigenvectors or of all filters' matrices, for derivatives by NumPy."""
+"""NumPy computes derivatives if the eigenvectors, and all filters' matrices, have at most this number of entries."""
 
 
 class Contraction(eqx.Module):
-    """A function of the kernel Φ C Φᵀ with a matrix C (k, k), linear in the kernel and in its own array leaves."""
+    """A function that is linear in the kernel Φ C Φᵀ of a matrix C (k, k), and linear in its own array leaves."""
 
     @abstractmethod
     def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m *s n"]:
@@ -125,7 +125,7 @@ def shapes(contraction: Contraction, filters: Filter, pairs: tuple[Array, Array,
 
 
 def by_numpy(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
-    """Return the derivative of a diagonal, or its cotangents, by NumPy; None if JAX should compute them."""
+    """Compute the derivative of a diagonal, or its cotangents, with NumPy; return None if JAX should compute them."""
     contraction, filters, pairs, _, selection, fixed, copies, space, _, reader = known
     values, vectors, kept = map(np.asarray, pairs)
     k = len(values) if selection is None else len(selection[0])

@@ -76,7 +76,7 @@ def _distance(pairs: Eigenpairs, filters: Filter, sources: Any) -> Float[Array, 
 
 
 def shape_dna(pairs: Eigenpairs, normalise: bool = True) -> Float[Array, " k"]:
-    """Return the scale-invariant eigenvalues λᵢ·volume^(2/d) (Reuter et al. 2006), or NaN if a pair is not kept.
+    """Return the scale-invariant λᵢ·volume^(2/d) (Reuter et al. 2006), or NaN where ``pairs.kept`` is false.
 
     Examples:
         >>> nine = hj.eigenpairs(hj.TensorField(field.grid, 9 * field.tensors), k=12)
@@ -92,9 +92,9 @@ def shape_dna(pairs: Eigenpairs, normalise: bool = True) -> Float[Array, " k"]:
 
 
 def global_point_signature(pairs: Eigenpairs) -> Float[Array, "m *shape"]:
-    """Return φᵢ(x)/√λᵢ for the positive λᵢ (Rustamov 2007), or NaN if a pair is not kept.
+    """Return φᵢ(x)/√λᵢ for the positive λᵢ (Rustamov 2007), or NaN where ``pairs.kept`` is false.
 
-    The signs and the bases of multiple eigenvalues are arbitrary.
+    The signs of the φᵢ and the bases of multiple eigenvalues' eigenspaces are arbitrary.
 
     Examples:
         >>> u = hj.global_point_signature(pairs)[0].ravel()
@@ -110,7 +110,7 @@ def global_point_signature(pairs: Eigenpairs) -> Float[Array, "m *shape"]:
 
 
 MARGIN = 10.0
-"""The least accepted ratio of a kernel to its truncation error. The kernel's logarithm then has an error of 0.1."""
+"""The least accepted ratio of a kernel to its truncation error; there, the kernel's logarithm has an error of 0.1."""
 GRID_LIMIT = 0.1
 """The largest accepted relative error of a squared distance due to the grid spacing."""
 
@@ -125,18 +125,18 @@ def varadhan_distance(
     the power of t. The error of d² is then −4t log u₀ + O(t²), which vanishes on a flat domain away from its boundary.
     Without normalisation the error has the further term 2nt log 4πt.
 
-    Small times need fine grids and many pairs: linear elements with node spacing h have the relative error h²d²/48t² of
-    d², and exp(−d²/4t) must exceed the truncation and rounding errors. The result is NaN where the estimated relative
-    error of the kernel or the grid's relative error of d² exceeds 0.1, outside the mask, and at Dirichlet nodes. Larger
-    times resolve larger distances, but with larger errors.
+    Small times need fine grids and many pairs: with linear elements of node spacing h, d² has the relative error
+    h²d²/48t², and exp(−d²/4t) must exceed the truncation and rounding errors. The result is NaN where the estimated
+    relative error of the kernel or the grid's relative error of d² exceeds 0.1, outside the mask, and at Dirichlet
+    nodes. Larger times resolve larger distances, but with larger errors.
 
     Args:
-        pairs: the result of `eigenpairs`; more pairs resolve larger distances. Paths stay in the domain: they go around
-            holes and across periodic sides. Under ``"mirror"`` and ``"mean"`` straight sides have no effect.
+        pairs: the result of `eigenpairs`; more pairs resolve larger distances. Geodesics stay in the domain: they go
+            around holes and across periodic sides. Under ``"mirror"`` and ``"mean"`` geodesics ignore straight sides.
         times: (n_times,) positive, in (metric length)²; a time of about d·h suits the distance d.
         sources: node indices (n_sources, d), or (d,) for one source; vertex numbers (n_sources,) on a mesh.
-        normalised: whether to divide by the diagonal. Otherwise the result depends on the unit, and is NaN where k_t >
-            1.
+        normalised: whether to divide by the diagonal. Otherwise the result depends on the unit of length, and is NaN
+            where k_t > 1.
 
     Raises:
         ValueError: if times are invalid or if a source is out of range, outside the mask or at a Dirichlet node.
@@ -177,22 +177,22 @@ def varadhan_distance(
 
 
 def _broadcast(values: Any, space: FunctionSpace) -> Any:
-    """Append axes of length one for the nodes to values that belong to sources or times."""
+    """Append an axis of length one for each axis of the nodes to values that belong to sources or times."""
     return values.reshape(*values.shape, *[1] * len(space.node_shape))
 
 
 # By the Cauchy–Schwarz inequality the errors of the normalised kernel are about as large as the errors of its diagonal.
 # The errors of the diagonal are the truncated share of the trace, and the residuals weighted by the terms of the trace.
 #
-# Linear elements have the eigenvalue ξ² (1 + ξ²h²/12) and the mass 1 − ξ²h²/6 at the frequency ξ along an axis. In the
-# kernel ∫ exp(iξd − tλ)/m dξ the means of powers of ξ are ⟨ξ²⟩ = (2t − d²)/4t² and ⟨ξ⁴⟩ = (d⁴ − 12td² + 12t²)/16t⁴. To
-# first order in h² the error of the squared distance is d²h² (d² − 4t)/48t², or −d²h² (d² − 12t)/48t² with a lumped
-# mass. Where this error matters, d² is several times t. The relative error of d² is then d²h²/48t², which is
-# h²/12t · log 1/k with d² = 4t log 1/k.
+# Linear elements have the eigenvalue λ = ξ² (1 + ξ²h²/12) and the mass m = 1 − ξ²h²/6 at the frequency ξ along an axis.
+# In the kernel ∫ exp(iξd − tλ)/m dξ the means of powers of ξ are ⟨ξ²⟩ = (2t − d²)/4t² and ⟨ξ⁴⟩ = (d⁴ − 12td² +
+# 12t²)/16t⁴. To first order in h² the error of the squared distance is d²h² (d² − 4t)/48t², or −d²h² (d² − 12t)/48t²
+# with a lumped mass. Where this error matters, d² is several times t. The relative error of d² is then d²h²/48t², which
+# is h²/12t · log 1/k with d² = 4t log 1/k.
 def _least_kernels(
     pairs: Eigenpairs, times: Float[Array, " m"], nodes: Int[np.ndarray, " s"]
 ) -> tuple[Float[Array, "m 1 *ones"], Float[Array, "m s *shape"]]:
-    """Return the least normalised kernel that the pairs resolve, and the least that the grid resolves."""
+    """Return the least normalised kernels that the pairs resolve, and the least ones that the grid resolves."""
     pairs, times = jax.lax.stop_gradient((pairs, times))
     space, resolution = pairs.space, pairs.pencil.resolution
     if resolution is None:
@@ -201,7 +201,7 @@ def _least_kernels(
     residuals = jnp.sum(weights * jnp.where(pairs.kept, pairs.residuals, 0)[None], axis=1) / jnp.sum(weights, axis=1)
     error = MARGIN * truncation(pairs, times).tail + residuals + 100 * jnp.finfo(times.dtype).eps
     at_nodes = jnp.where(space.free, jnp.square(resolution.mesh_width), 0)
-    # The spacing along the geodesic is not known. The spacing at its ends or, if larger, the mean spacing is used.
+    # The spacing along the geodesic is not known. The larger of the mean spacing and the spacing at its ends is used.
     along = jnp.maximum(
         jnp.maximum(at_nodes[None], _broadcast(at_nodes.ravel()[nodes], space)), jnp.sum(at_nodes) / space.n_dof
     )

@@ -30,7 +30,7 @@ class Filter(eqx.Module):
 
 @jax.custom_jvp
 def _mean_decay(y: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Return the mean of exp(−sy) over 0 ≤ s ≤ 1, y ≥ 0."""
+    """Return the mean of exp(−sy) over s from 0 to 1, where y ≥ 0."""
     return jnp.where(y > 0, -jnp.expm1(-y) / jnp.where(y > 0, y, 1), 1)
 
 
@@ -39,7 +39,7 @@ def _mean_decay_jvp(
     primals: tuple[Float[Array, "*n"]], tangents: tuple[Float[Array, "*n"]]
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
     def free_of_cancellation(y: Array) -> Array:
-        """Return the mean of exp(−sy), with derivatives by quadrature where y is small."""
+        """Return the mean of exp(−sy) over s from 0 to 1; where y is small, the mean is computed by quadrature."""
         small = y < 1
         nodes, weights = gauss(8)
         near = sum(w * jnp.exp(-s * jnp.where(small, y, 0)) for s, w in zip(nodes, weights, strict=True))
@@ -60,7 +60,7 @@ class Heat(Filter):
         return jnp.exp(-self.time * x)
 
     def divided_difference(self, low: Float[Array, "*n"], high: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return −t exp(−t·low) (1 − e^(−y))/y, y = t (high − low)."""
+        """Return −t exp(−t·low) (1 − e^(−y))/y, where y = t (high − low)."""
         return -self.time * jnp.exp(-self.time * low) * _mean_decay(self.time * (high - low))
 
 
@@ -127,7 +127,7 @@ def weights_of(one: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"])
 def mixing(
     filters: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"], fixed: bool
 ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"], Float[Array, "m k k"], Bool[Array, "m k"]]:
-    """Return f(λᵢ), the divided differences [f] and [λf], and whether f or λf' matters at λᵢ, for each filter.
+    """Return f(λᵢ), the divided differences of f and λf, and whether f or λf' matters at λᵢ, for each filter f.
 
     A value does not matter if it is negligible relative to the largest value at positive eigenvalues.
     """
@@ -138,13 +138,13 @@ def mixing(
         f = weights_of(one, values, kept)
         quotient = (f[:, None] - f[None]) / jnp.where(gap == 0, 1, gap)
         of_f = jnp.where(kept[:, None] & kept[None], one.divided_difference(low, high), quotient)
-        # Between null vectors that all perturbations annihilate, [f] has no effect, and f may have no derivative at 0.
+        # If all perturbations annihilate the null vectors, ``of_f`` has no effect between them, and f' may not exist.
         of_f = jnp.where((high == 0) & (fixed | ~jnp.isfinite(of_f)), 0, of_f)
         # Using f at the larger eigenvalue, where f is small, avoids cancellation.
         of_lambda_f = jnp.where(gap >= 0, f[:, None], f[None]) + low * of_f
         size = jnp.maximum(jnp.abs(f), jnp.abs(values * jnp.diagonal(of_f)))
-        # Between two negligible pairs, [f] is at most f' at one of them or, if f is not monotone, ε over the relative
-        # gap. NaN counts as not negligible.
+        # Between two negligible pairs, the divided difference is at most f' at one of the pairs or, if f is not
+        # monotone, ε over the relative gap. NaN counts as not negligible.
         negligible = size <= jnp.finfo(f.dtype).eps * jnp.max(jnp.where(values > 0, size, 0))
         return f, of_f, of_lambda_f, ~negligible
 

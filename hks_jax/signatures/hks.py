@@ -29,7 +29,7 @@ from hks_jax.spectrum_free.plan import Unattainable, choose_method, least_work, 
 from hks_jax.traced import is_traced
 
 _DEARER = 10.0
-"""The maximum work of comparing both methods at one time, relative to the work of the spectrum-free times."""
+"""The largest work for which both methods are compared at one time, relative to the work at the spectrum-free times."""
 
 Normalisation = Literal["raw", "heat-trace", "volume", "flat"]
 HKSMethod = Literal["spectral", "spectrum-free", "auto"]
@@ -42,10 +42,11 @@ class AutomaticHKS(eqx.Module):
         values: (n_times, *shape).
         times: (n_times,).
         spectral: (n_times,) bool, true at times computed from eigenpairs, false at spectrum-free times.
-        tail: (n_times,) the estimated share beyond the eigenpairs (`truncation`), by which the method was chosen.
-        method: the method at spectrum-free times: ``"colouring"`` or ``"selected-inversion"``; ``"none"`` without them.
+        tail: (n_times,) the estimated share of the signature beyond the eigenpairs, by which the method was chosen.
+        method: ``"colouring"`` or ``"selected-inversion"`` at spectrum-free times; ``"none"`` without such times.
         overlap_time: the shortest time computed from eigenpairs, if the methods were compared there; otherwise NaN.
-        overlap_difference: the greatest difference at that time, relative to (4πt)^(−d/2); NaN if not compared.
+        overlap_difference: the greatest difference at that time, relative to (4πt)^(−d/2); NaN if `overlap_time` is
+            NaN.
     """
 
     values: Float[Array, "n_times *shape"]
@@ -127,9 +128,9 @@ def hks_auto(
 ) -> AutomaticHKS:
     """Compute the heat kernel signature with the suitable method at each time, and report the choice.
 
-    The signature at a time is computed from the eigenpairs if the estimated share beyond them is at most the tolerance,
-    and otherwise by `hks_spectrum_free`. If there are times of both kinds, both methods are compared at the shortest
-    time of the eigenpairs, provided that this takes at most ten times the work of the spectrum-free times.
+    The signature is computed from the pairs at times at which the estimated share beyond the pairs is at most the
+    tolerance, and otherwise by `hks_spectrum_free`. If there are times of both kinds, both methods are compared at the
+    shortest time of the eigenpairs, provided that this takes at most ten times the work of the spectrum-free times.
 
     Args:
         times: (n_times,) positive; the normalisation is as in `hks`.
@@ -164,7 +165,7 @@ def hks_auto(
     settings = choose_method(pencil, times[small], "auto", tolerance)
     raw = hks_spectrum_free(pencil, times[small], method=settings or "selected-inversion", tolerance=tolerance)
     others = _scaled(pairs, times[small], normalisation, raw)
-    # The signature at these times does not use the k pairs, so warn only about the grid.
+    # The signature at spectrum-free times does not use the k pairs, so the warnings concern only the grid.
     some = jax.tree.map(lambda leaf: leaf[small] if leaf.ndim else leaf, estimate)
     for message in eqx.tree_at(lambda e: e.tail, some, jnp.zeros(small.size)).messages():
         warn_of_accuracy(message)
@@ -254,7 +255,7 @@ def boundary_influence(
         solver: the same as for `eigenpairs`.
 
     Raises:
-        ValueError: if the boundary is invalid, if no or every node lies on it, or as in `eigenpairs` and `hks`.
+        ValueError: if the boundary is invalid, if no node or every node lies on it, or as in `eigenpairs` and `hks`.
 
     Warns:
         AccuracyWarning: as in `eigenpairs` and `hks`.
@@ -277,7 +278,7 @@ def boundary_influence(
         pencil = assemble(domain, _glued(domain, boundary))
         pairs = (eigenpairs(part, k, solver=solver, multiplet="complete") for part in pencil.parts)
         free, zero = (hks(each, times) for each in pairs)
-    # Rounding, where both are nearly equal, and truncation, where both are small, may cause values outside [0, 1].
+    # Rounding (if both signatures are nearly equal) and truncation (if both are small) may give values outside [0, 1].
     return jnp.clip((free - zero) / (free + zero), 0, 1)
 
 

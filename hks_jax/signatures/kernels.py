@@ -58,7 +58,7 @@ def scale_invariant_hks(
 ) -> Float[Array, "n_frequencies *shape"]:
     """Compute the scale-invariant HKS (Bronstein and Kokkinos 2010): |FFT(d/dτ log HKS(exp τ, x))| at low frequencies.
 
-    Scaling the metric by β shifts τ by log β² and lowers log HKS by a constant. The derivative removes the constant,
+    Scaling all lengths by β shifts τ by log β² and lowers log HKS by a constant. The derivative removes the constant,
     and the modulus of the Fourier transform removes the shift. The default times scale with the spectrum, so invariance
     is exact. The moduli are dimensionless, and NaN outside the mask and at Dirichlet nodes.
 
@@ -138,8 +138,8 @@ def spectral_signature(
     """Compute Σᵢ f(θ, λᵢ) φᵢ(x)², or with sources Σᵢ f(θ, λᵢ) φᵢ(x_s) φᵢ(x), for any f and each of m parameters θ.
 
     The heat kernel signature is ``spectral_signature(pairs, lambda t, x: jnp.exp(-t * x), times)``. Derivatives with
-    respect to the tensors and to θ are exact at eigenvalues of any multiplicity. With sources the result is
-    (m, n_sources, *shape); NaN outside the mask.
+    respect to the tensors and to θ are exact at eigenvalues of any multiplicity. With sources the result has the shape
+    (m, n_sources, *shape). The result is NaN outside the mask.
 
     Args:
         function: maps (θ, λ) to f elementwise for λ of any shape, and is differentiable by JAX for λ > 0. Pass traced

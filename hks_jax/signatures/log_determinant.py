@@ -18,13 +18,13 @@ from hks_jax.signatures.truncation import truncation
 from hks_jax.traced import is_traced
 
 _FIRST = 18.0
-"""The least λ_last·T. Each eigenvalue beyond the last then contributes less than 1e-9."""
+"""The least product of the last eigenvalue and T, at which each further eigenvalue contributes less than 1e-9."""
 _TIMES, _PER_DOUBLING = 12, 2
 """The number of times T that are tried, and the number of steps in which T doubles."""
 _DOUBTFUL = 0.01
 """The estimated error above which a warning is issued."""
 _SMALL, _TERMS, _NODES = 2.0, 20, 32
-"""The largest argument for the series of E₁, its number of terms, and the quadrature points for larger arguments."""
+"""The largest argument for the series of E₁, the number of terms, and the number of quadrature points beyond it."""
 
 
 class LogDeterminant(NamedTuple):
@@ -33,7 +33,7 @@ class LogDeterminant(NamedTuple):
     Attributes:
         value: log det′ Δ.
         error: an estimate of the discretisation error and of omitted terms of the heat trace; constant in derivatives.
-        time: the time T up to which the heat trace is computed from its coefficients, and after which from eigenvalues;
+        time: the time T; the heat trace comes from its coefficients before T, and from eigenvalues after T. T is
             constant in derivatives.
     """
 
@@ -51,10 +51,11 @@ def heat_coefficients(
 ) -> Float[Array, " 3"]:
     """Return a₀, a₁, a₂ of the heat trace Σ exp(−λᵢt) ~ a₀/t + a₁/√t + a₂ of a surface (Kac 1966; McKean, Singer 1967).
 
-    These are a₀ = V/4π, a₁ = ±L/8√π (+ for Neumann conditions) and a₂ = χ/6 + Σ (π − θ)²/24πθ over the corners.
+    With area V, boundary length L, Euler characteristic χ and corner angles θ, these are a₀ = V/4π, a₁ = ±L/8√π (+ for
+    Neumann conditions) and a₂ = χ/6 + Σ (π − θ)²/24πθ.
 
     Args:
-        pairs: the result of `eigenpairs` in 2D. V is the area, under "mirror" and "mean" of the doubled domain.
+        pairs: the result of `eigenpairs` in 2D. Under "mirror" and "mean", V is the area of the doubled domain.
         euler_characteristic: χ, which is 2 for a sphere, 0 for a torus, and 1 for a disc or a square.
         boundary_length: L, in the units of the metric.
         corners: the inner angles θ of the boundary's corners, in radians; for a square, four times π/2.
@@ -86,7 +87,7 @@ def heat_coefficients(
 #     Γ(s) ζ(s) = ∫₀^∞ t^(s−1) (Z(t) − n₀) dt,    Z(t) ~ Σⱼ aⱼ t^pⱼ,    pⱼ = (j − d)/2.
 #
 # Up to T each term of the expansion of Z is integrated and continued analytically. Beyond T each exponential is
-# integrated. With 1/Γ(s) = s + γs² + … the value at zero is
+# integrated. With 1/Γ(s) = s + γs² + … the derivative of ζ at zero is
 #
 #     −log det′ = ζ′(0) = (a_d − n₀) (log T + γ) + Σ_{j≠d} aⱼ T^pⱼ/pⱼ + Σ E₁(λᵢT).
 #
@@ -98,8 +99,9 @@ def log_determinant(
     """Compute log det′ Δ = −ζ′(0), where ζ(s) = Σ λᵢ^(−s) is the sum over the positive eigenvalues.
 
     The heat trace's expansion at small times accounts for the remaining eigenvalues. The result is differentiable with
-    respect to the eigenvalues and the coefficients. Errors of the eigenvalues limit the accuracy: for linear elements
-    with spacing h in 2D the error is about a₀h²/16T². So a small T requires many pairs and a fine grid.
+    respect to the eigenvalues and the coefficients. Errors of the eigenvalues limit the accuracy: if the expansion is
+    used up to the time T, linear elements with spacing h in 2D cause an error of about a₀h²/16T². So a small T requires
+    many pairs and a fine grid.
 
     Args:
         pairs: the lowest eigenpairs, from `eigenpairs`.
@@ -136,7 +138,7 @@ def log_determinant(
     _, last = jax.lax.stop_gradient(positive_range(pairs))
     steps = 2.0 ** (np.arange(_TIMES) / _PER_DOUBLING)
     times = _FIRST / last * jnp.asarray(steps, dtype) if time is None else jnp.asarray(time, dtype)[None]
-    # Values at each of m times multiplied by 1, √2, 2, 2√2, …; the odd powers of √2 serve the error estimate.
+    # Each of m times is multiplied by 1, √2, 2, 2√2, …; values at odd powers of √2 serve the error estimate.
     count = powers.size + 1
     doublings = 2.0 ** (np.arange(2 * count + 1) / 2)
     values = _at(pairs, a, d, times[:, None] * jnp.asarray(doublings, dtype)[None])
@@ -144,7 +146,7 @@ def log_determinant(
     weights = np.linalg.solve(2.0 ** np.outer(np.append(0, powers), np.arange(count)), np.eye(count)[0])
     levels = [values[:, i : i + 2 * count : 2] @ jnp.asarray(weights, dtype) for i in range(3)]
     rest = jnp.maximum(jnp.abs(levels[0] - levels[1]), jnp.abs(levels[0] - levels[2]))
-    # The error of the trace of linear elements is d h²/16t, three times the error of the signature at a node.
+    # With linear elements the trace has the relative error d h²/16t, three times the error of the signature at a node.
     bias = 3 * truncation(pairs, times).resolution_bias * jnp.abs(a[0]) * times ** (-d / 2) / (d / 2 + 1)
     errors = jax.lax.stop_gradient(rest + jnp.where(jnp.isfinite(bias), bias, 0))
     best = jnp.argmin(jnp.where(jnp.isfinite(errors), errors, jnp.inf))

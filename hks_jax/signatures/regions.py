@@ -44,7 +44,7 @@ def region_statistics(values: Any, labels: Any, node_volume: float = 1.0) -> Reg
         One entry for each nonzero label. A region without a node in the domain has coverage 0 and NaN statistics.
 
     Raises:
-        ValueError: if shapes disagree, if labels are not integers or all 0, or if the nodes with values depend on time.
+        ValueError: if shapes disagree, if labels are all 0 or not integers, or if the nodes with values depend on time.
 
     Examples:
         >>> labels = np.where(field.grid.nodes[..., 0] < 0.5, 1, 2)

@@ -65,7 +65,7 @@ def spectral_flow(
 
     Under "mirror" and "mean" the functions are extended evenly, like the metric.
     """
-    # Each doubling of the domain multiplies inner products of even functions by two; products with odd functions are 0.
+    # Each doubling of the domain doubles inner products of even functions; even and odd functions have the product 0.
     everywhere = pairs.on(on_all_nodes(pairs.pencil))
     parts, known = everywhere.pencil.parts, pairs.space.restrict(functions)
     functionals = len(parts) * parts[0].integrals(pairs.space.transfer(known, everywhere.space))
@@ -91,14 +91,15 @@ def _weighted(contraction: Contraction, weights: Float[Array, "m k"], vectors: F
     return contraction.weighted(weights, vectors)
 
 
-# The kernel f(M⁻¹K)M⁻¹ is a smooth function of K and M even where the eigenvectors are not. For all n eigenpairs its
-# differential is Φ F Φᵀ. With G = Φᵀ dK Φ, H = Φᵀ dM Φ and divided differences of f (Daleckii and Krein 1965),
+# The kernel f(M⁻¹K)M⁻¹ is a smooth function of K and M even where the eigenvectors are not smooth. Let Φ have all n
+# eigenvectors. With G = Φᵀ dK Φ, H = Φᵀ dM Φ and divided differences of f (Daleckii and Krein 1965), the differential
+# of the kernel is Φ F Φᵀ, where
 #
 #     F = [f]∘G − [λf]∘H,    [f]ᵢⱼ = (f(λᵢ) − f(λⱼ))/(λᵢ − λⱼ),  [f]ᵢᵢ = f'(λᵢ),    [λf]ᵢⱼ = f(λᵢ) + λⱼ [f]ᵢⱼ.
 #
 # F does not depend on the basis chosen for a multiple eigenvalue, and is not singular there. Truncation sets f to zero
-# on all pairs that are not kept. Then F is unchanged among the kept pairs, and between a kept i and all other j the
-# entries f(λᵢ) (Gᵢⱼ − λᵢHᵢⱼ)/(λᵢ − λⱼ) add up to
+# on all pairs that are not kept. Then F is unchanged among the kept pairs. Between a kept pair i and all other pairs j
+# the entries f(λᵢ) (Gᵢⱼ − λᵢHᵢⱼ)/(λᵢ − λⱼ) add up to
 #
 #     Σᵢ f(λᵢ) (φᵢxᵢᵀ + xᵢφᵢᵀ),    xᵢ = (I − ΦΦᵀM) dφᵢ,
 #
@@ -171,7 +172,7 @@ def _tangent(
     change: Pencil,
     reader: Pencil | None,
 ) -> Array:
-    """Return the derivative for the change of one part, given its pairs and the derivative of their frame."""
+    """Return the derivative for the change of one part, given the part's pairs and the derivative of their frame."""
     values, vectors, kept, d_frame = (x if selection is None else x[selection[0]] for x in (*pairs, d_frame))
     if selection is not None:
         vectors = jnp.where(selection[1][:, None], vectors, 0)  # pairs of different parts do not mix

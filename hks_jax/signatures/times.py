@@ -1,4 +1,4 @@
-"""Checks of eigenpairs and times, default times and energies, and times that suit a metric before it has eigenpairs."""
+"""Checks of eigenpairs and times, default times and energies, and times that suit a metric without eigenpairs."""
 
 import math
 from typing import Any
@@ -54,7 +54,7 @@ def _stated(value: Any, name: str, of: str, purpose: str) -> Any:
 
 
 def positive_range(pairs: Eigenpairs) -> tuple[Array, Array]:
-    """Return the first positive and the last eigenvalue; raise ValueError if none can be positive.
+    """Return the first positive and the last eigenvalue; raise ValueError if no eigenvalue can be positive.
 
     A multiple eigenvalue is returned as the mean over its multiplet, which is differentiable.
     """
@@ -87,8 +87,8 @@ def default_times(pairs: Eigenpairs, n: int = 16, decay: float = 1e-4) -> Float[
     """Return n times, log-spaced from 4 ln10/λ_last to 4 ln10/λ₁ (Sun, Ovsjanikov and Guibas 2009, section 5).
 
     At the first time the last mode has decayed by the factor 1e-4. At the last time, which is not before the first, all
-    modes except the constant have decayed at least by the factor `decay`. The command line uses 0.085: then √t is half
-    the length of an interval with the same λ₁.
+    modes except the constant have decayed at least by the factor `decay`. The command line uses the decay 0.085; at the
+    last time √t is then half the length of an interval with the same λ₁.
 
     Examples:
         >>> times = hj.default_times(pairs, 3)
@@ -128,13 +128,13 @@ DEFAULT_K = {2: 200, 3: 100}
 RESOLVED = {2: 4.6, 3: 5.7}
 """The least λ_k·t, by dimension, at which at most 1 % of the signature lies beyond k pairs (`hks_jax.truncation`)."""
 LAST = (math.pi / 2) ** 2
-"""The value of λ₁·t at the largest time, at which √t is half the length of an interval with this eigenvalue."""
+"""The value of λ₁·t at the largest time, at which √t is half the length of an interval with the first eigenvalue λ₁."""
 COARSE = 6.0
 """The least t/h² at which the grid spacing h biases the signature by at most 1 %."""
 
 
 def default_k(dimension: int, unknowns: int) -> int:
-    """Return the default number of eigenpairs: `DEFAULT_K`, or a quarter of the unknowns if that is less."""
+    """Return the default number of eigenpairs: `DEFAULT_K`, or a quarter of the unknowns if this quarter is less."""
     return max(1, min(DEFAULT_K[dimension], unknowns // 4))
 
 
@@ -157,7 +157,7 @@ def suitable(metric: Any, spacing: Any, inside: Bool[np.ndarray, "*shape"], boun
 def suitable_times(
     dimension: int, volume: float, width2: float, size: float, nodes: int, problems: int = 1
 ) -> dict[str, float]:
-    """Return the least time that the spacing resolves, its k, the least time for the default k, and a largest time.
+    """Return the least time that the spacing resolves, its k, the default k, its least time, and the largest time.
 
     `width2` is the squared distance between neighbouring nodes, and `size` is the domain's length. Under "mean" and
     "mirror" several problems share the eigenpairs.

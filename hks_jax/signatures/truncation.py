@@ -36,7 +36,8 @@ class Truncation(eqx.Module):
         tail: (n,) the share of the heat trace beyond the k pairs, by Weyl's law. This share is a mean over the domain;
             single nodes lack more (`truncation_map`).
         resolution_bias: (n,) the relative discretisation error at the median node.
-        lasting_bias: (n,) the part of this error that does not decrease with t, due to tensors that turn or stretch.
+        lasting_bias: (n,) the part of `resolution_bias` that does not decrease with t, from tensors that turn or
+            stretch.
         coarse_fraction: (n,) the fraction of nodes where the discretisation error exceeds 10 %.
         smallest_time: the least time at which `tail` is at most 1 %. The worst node then lacks up to 6 %, or 20 %
             beside a Dirichlet side.
@@ -100,13 +101,13 @@ def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]
     trace beyond Λ. This part is a mean over the domain; `truncation_map` estimates the error at each node.
 
     The discretisation error has two parts of leading order in the spacing h. The first part is d h²/48t for a constant
-    metric whose axes are those of the grid, and larger otherwise. The second part does not decrease with t: where
-    tensors turn or stretch between nodes, elements are too stiff and the interpolated tensors have another volume. With
-    enough pairs the measured median error on such fields was 1/3 to 3 times the estimate, and 1/4 of the estimate for
-    eigenvalue ratios of 30 on coarse grids. On meshes only the first part is estimated.
+    metric that is diagonal in the grid's axes, and larger for other metrics. The second part does not decrease with t:
+    where tensors turn or stretch between nodes, elements are too stiff and the interpolated tensors have another
+    volume. With enough pairs the measured median error on such fields was 1/3 to 3 times the estimate, and 1/4 of the
+    estimate for eigenvalue ratios of 30 on coarse grids. On meshes only the first part is estimated.
 
-    With a potential or an unknown null space, an exponent that follows from the mean of the eigenvalues replaces d/2,
-    if it is larger. The discretisation error is then NaN, as it is for matrices without a node spacing.
+    With a potential or an unknown null space, the mean of the eigenvalues gives an exponent, which replaces d/2 if it
+    is larger. The discretisation error is then NaN, as it is for matrices without a node spacing.
 
     Raises:
         ValueError: if times are not positive and finite, pairs lie in an interval, or the dimension is not known.
@@ -167,10 +168,11 @@ def _truncation(
     return tail, median_of_shares(xp, bias, free), median_of_shares(xp, lasting, free), coarse, smallest
 
 
-# If all eigenvalues are larger by the factor 1 + δ, the heat trace at t becomes Z((1 + δ)t). This error is proportional
-# to s = −(2/d) d log Z/d log t, which is 1 at small t (Weyl) and 0 where only the constant is left. If the volume is
-# larger by the factor 1 + v, the metric is multiplied by (1 + v)^(2/d). This divides the signature by 1 + v and the
-# eigenvalues by (1 + v)^(2/d), which is an error of v(1 − s). The truncated part of the trace has s = 1.
+# If all eigenvalues are larger by the factor 1 + δ, the heat trace Z(t) becomes Z((1 + δ)t). The relative error is
+# proportional to s = −(2/d) d log Z/d log t, which is 1 at small t and 0 where only the constant function is left. If
+# the volume is larger by the factor 1 + v, the metric is larger by the factor (1 + v)^(2/d). This divides the signature
+# by 1 + v and the eigenvalues by (1 + v)^(2/d): a relative error of size v(1 − s). The truncated part of the trace has
+# s = 1.
 def _resolution_bias(
     xp: Any, errors: tuple[Any, Any, Any], free: Any, times: Any, slope: Any, order: int
 ) -> tuple[Any, Any]:
@@ -189,7 +191,7 @@ def _resolution_bias(
 def median_of_shares(xp: Any, x: Any, free: Any) -> Any:
     """Return the medians (n,) over the free nodes of numbers (n, nodes) in [0, 1]; the numbers are 0 at other nodes.
 
-    The accuracy is 1e-12, and NaN gives NaN. Bisection is ten times as fast as sorting in JAX.
+    The accuracy is 1e-12. The median of numbers with a NaN is NaN. Bisection is ten times as fast as sorting in JAX.
     """
     twice_half = 2 * free.size - xp.sum(free)
 
@@ -230,10 +232,10 @@ _EXPONENTS = np.geomspace(0.5, 8, 33)
 _RESOLVING = scipy.special.gammainccinv(_EXPONENTS, TAIL_LIMIT)
 """The least Λt at which at most `TAIL_LIMIT` of the heat trace lies beyond Λ, for each of `_EXPONENTS`."""
 _POINTS, _WEIGHTS = np.polynomial.laguerre.laggauss(24)
-"""Gauss–Laguerre quadrature of f(u) e^(−u) from 0 to ∞."""
+"""The points and weights of Gauss–Laguerre quadrature, for integrals of f(u) e^(−u) from 0 to ∞."""
 
 
-# If N(λ) = N(Λ) (λ/Λ)^a, the part beyond Λ is
+# If N(λ) = N(Λ) (λ/Λ)^a eigenvalues are below λ, the part of the heat trace beyond Λ is
 #
 #     ∫_Λ^∞ e^(−λt) dN = N(Λ) a (Λt)^(−a) ∫_Λt^∞ e^(−y) y^(a−1) dy = N(Λ) (a/x) e^(−x) ∫_0^∞ (1 + u/x)^(a−1) e^(−u) du
 #
@@ -242,7 +244,7 @@ _POINTS, _WEIGHTS = np.polynomial.laguerre.laggauss(24)
 def beyond(count: Float[Array, "..."], exponent: Float[Array, "..."], x: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return ∫ e^(−λt) dN over λ > Λ, with N(λ) = count · (λ/Λ)^exponent and x = Λt.
 
-    The accuracy for exponents from ½ to 8 is 1e-3 for x ≥ 0.1 and 1e-7 for x ≥ 1. If x < 1e-3, x = 1e-3 is used.
+    The accuracy for exponents from ½ to 8 is 1e-3 for x ≥ 0.1 and 1e-7 for x ≥ 1. Values x < 1e-3 are replaced by 1e-3.
     """
     x = jnp.maximum(x, 1e-3)  # prevents overflow
     count, exponent = (jnp.expand_dims(each, tuple(range(x.ndim - each.ndim))) for each in (count, exponent))
@@ -256,9 +258,9 @@ def beyond(count: Float[Array, "..."], exponent: Float[Array, "..."], x: Float[A
     return count * exponent / x * jnp.exp(-x) * integral
 
 
-# The integral is 1 for a = 1. For a = 3/2, integration by parts gives 1 + (√π/2) erfc(√x) e^x/√x.
+# The integral over u is 1 for a = 1. For a = 3/2, integration by parts gives 1 + (√π/2) erfc(√x) e^x/√x.
 def beyond_by_weyl(xp: Any, count: Any, dimension: int, x: Any) -> Any:
-    """Return `beyond` of x (...) for Weyl's exponent d/2, d = 2 or 3."""
+    """Return `beyond` for Weyl's exponent d/2, where d is 2 or 3."""
     if dimension == 2:
         return count * xp.exp(-x) / x
     complement = erfc if xp is jnp else scipy.special.erfc
@@ -288,8 +290,8 @@ def truncation_map(
     about d/2 inside and at Neumann sides, and d/2 + 1 at a Dirichlet side.
 
     The result is an estimate, not a bound. On small grids the largest true share of a node was 0.25 to 2 times the
-    largest estimate if the mean exceeded 0.1 %, and up to 3 times the estimate if the mean was 1e-6. The result is NaN
-    outside the mask, and 0 at Dirichlet nodes or with all pairs. Derivatives treat the result as a constant.
+    largest estimate if the mean share exceeded 0.1 %, and up to 3 times the estimate if the mean was 1e-6. The result
+    is NaN outside the mask, and 0 at Dirichlet nodes or if no pairs are left out. Derivatives treat it as constant.
 
     Args:
         times: (n_times,) positive, in (metric length)².

@@ -14,7 +14,7 @@ from hks_jax.linear.chebyshev import coefficient_tails, least_degree
 from hks_jax.spectrum_free.spectrum_bounds import Bounds
 
 _STEEPEST = 0.9
-"""The share of the steepest decay rate of M⁻¹ that the bound uses. A share near 1 gives a large factor in the bound."""
+"""The bound uses this share of the steepest decay rate of M⁻¹. A share near 1 gives the bound a large factor."""
 
 
 @dataclass(frozen=True)
@@ -69,18 +69,18 @@ class Colouring:
 
 
 def reach_bound(distance: Any, reach_time: Any, low: float, across: float) -> Any:
-    """Return a bound on √(D_x D_y) times the kernel between nodes at this distance along an axis.
+    """Return a bound on √(D_x D_y) times the kernel of nodes x, y at this distance along an axis; D has M's row sums.
 
-    Davies' method uses weights exp(ψ) with ψ = αi at node i along the axis. Let A = D^(−½)KD^(−½), and let κ be the
-    reach. Then ‖exp(ψ) exp(−tA) exp(−ψ)‖ ≤ exp(t κ (cosh α − 1)): only the symmetric part of the weighted K matters, in
-    which couplings across the axis are multiplied by cosh α. So the kernel is at most exp(−αs + tκ (cosh α − 1)), whose
-    minimum is at sinh α = s/tκ. This is the Gaussian kernel exp(−s²/2tκ) for s ≪ tκ and the decay of a random walk for
-    s ≫ tκ.
+    Davies' method uses weights exp(ψ) with ψ = αi at node i along the axis. Let A = D^(−½)KD^(−½), let κ be the reach,
+    and let s be the distance. Then ‖exp(ψ) exp(−tA) exp(−ψ)‖ ≤ exp(t κ (cosh α − 1)): only the symmetric part of the
+    weighted K matters, in which couplings across the axis are multiplied by cosh α. So the kernel is at most exp(−αs +
+    tκ (cosh α − 1)), whose minimum is at sinh α = s/tκ. This is the Gaussian kernel exp(−s²/2tκ) for s ≪ tκ and the
+    decay of a random walk for s ≫ tκ.
 
     A consistent mass M has a nonlocal inverse. The symmetric part of the weighted M is M + (cosh α − 1) C, where C has
     the couplings across the axis and −C ⪯ βM. So this part is at least low (1 − β (cosh α − 1)) D, and entries of M⁻¹
-    are at most exp(−αs) divided by that factor. The product of both bounds is a bound for t → 0 and for a constant
-    metric. For varying metrics and other times it is not proven.
+    are at most exp(−αs) divided by the factor of D. The product of both bounds is a bound for t → 0 and for a constant
+    metric. For varying metrics and other times the product is not a proven bound.
     """
     s = np.asarray(distance, float)
     alpha = np.arcsinh(s / reach_time)
@@ -92,9 +92,9 @@ def reach_bound(distance: Any, reach_time: Any, low: float, across: float) -> An
 
 
 def _unit(time: float, limits: Bounds, dimension: int) -> float:
-    """Return the unit of errors times the least entry of D.
+    """Return the unit of errors times the least row sum of M.
 
-    The unit is the diagonal of the flat kernel, or the least 1/D if the grid does not resolve the time.
+    The unit is the diagonal of the flat kernel, or the least inverse row sum if the grid does not resolve the time.
     """
     return limits.least_mass * min((4 * math.pi * time) ** (-dimension / 2), 1 / limits.greatest_mass)
 
@@ -109,7 +109,7 @@ def error_bound(spacing: tuple[int, ...], degree: int, time: float, limits: Boun
     low, d = limits.low, space.dimension
     tails = coefficient_tails(time * limits.top / 2)
     beyond = float(tails[min(degree + 1, tails.size - 1)])
-    # The distances of the sources of one colour along each axis, in spacings. All but the first occur twice.
+    # The distances of the sources of one colour along each axis, in spacings. All distances but 0 occur twice.
     of_axes = zip(space.node_shape, spacing, space.periodic, strict=True)
     steps = [np.arange(max(n // s, 1) // 2 + 1 if wraps else -(-n // s)) for n, s, wraps in of_axes]
     distances = [s * along for s, along in zip(spacing, steps, strict=True)]
@@ -127,11 +127,12 @@ def error_bound(spacing: tuple[int, ...], degree: int, time: float, limits: Boun
 
 
 def mass_error(mass_degree: int, time: float, limits: Bounds, dimension: int) -> float:
-    """Return a bound, to first order in ε = max |1 − μ p(μ)|, on the relative error due to the approximation P of M⁻¹.
+    """Return a bound, to first order in ε, on the relative error due to the approximation P = p(D⁻¹M)D⁻¹ of M⁻¹.
 
-    Let w = M^(−½)e_x, S = M^(−½)KM^(−½) and P = M^(−½)(1 − E)M^(−½) with ‖E‖ ≤ ε. Duhamel's formula, with integration
-    by parts at small times, bounds the error by 4.5 ε ‖w‖ ‖exp(−St/4)w‖ = 4.5 ε √((M⁻¹)ₓₓ HKS(t/2, x)). Both factors
-    under the root are at most 1/(low D). The result is relative to the unit of errors.
+    Let ε = max |1 − μ p(μ)| over the eigenvalues μ of D⁻¹M, w = M^(−½)e_x, S = M^(−½)KM^(−½), P = M^(−½)(1 − E)M^(−½).
+    Then ‖E‖ ≤ ε. Duhamel's formula, with integration by parts at small times, bounds the error by 4.5 ε ‖w‖
+    ‖exp(−St/4)w‖ = 4.5 ε √((M⁻¹)ₓₓ HKS(t/2, x)). Both factors are at most 1/(low D). The result is relative to the unit
+    of errors.
     """
     low = limits.low
     if low == 1:
@@ -143,8 +144,8 @@ def mass_error(mass_degree: int, time: float, limits: Bounds, dimension: int) ->
 def rounding_error(time: float, limits: Bounds, dimension: int, eps: float) -> float:
     """Return an estimate of the rounding error of the signature, relative to the unit of errors.
 
-    The vectors of the recurrence are as large as M⁻¹ at their source, at most 1/(low D), and D is rounded too. Measured
-    errors did not grow with the degree and were 0.05 to 0.7 times this estimate in float32.
+    The vectors of the recurrence are as large as M⁻¹ at their source, at most 1/(low D), and the row sums D of M are
+    rounded. Measured errors did not grow with the degree and were 0.05 to 0.7 times this estimate in float32.
     """
     return eps * (1 + 1 / limits.low) / _unit(time, limits, dimension)
 

@@ -37,15 +37,15 @@ def hks_spectrum_free(
 ) -> Float[Array, "n_times *shape"]:
     """Compute the heat kernel signature without eigenpairs: the diagonal of exp(−tM⁻¹K)M⁻¹.
 
-    The result equals the signature of all eigenpairs of the discretisation, at any t. The cost of colouring grows with
-    t/h², whereas the cost of eigenpairs falls; selected inversion costs the same at any t. docs/spectrum-free.md
-    derives the bounds. The unit is 1/(metric length)^d. Values are NaN outside the mask, 0 at Dirichlet nodes, and all
-    NaN if a given `Colouring` was made for a smaller largest eigenvalue, or for shorter times.
+    The result equals the signature of all eigenpairs of the discretisation, at any t. For node spacing h, the cost of
+    colouring grows with t/h², whereas the cost of eigenpairs falls; selected inversion costs the same at any t.
+    docs/spectrum-free.md derives the bounds. The unit is 1/(metric length)^d. Values are NaN outside the mask, 0 at
+    Dirichlet nodes, and all NaN if a given `Colouring` was made for a smaller largest eigenvalue, or for shorter times.
 
     Args:
         domain: a tensor field on a grid, a mesh of triangles or tetrahedra, or a pencil of either from `assemble`.
         times: (n_times,) positive, in (metric length)².
-        boundary: see `assemble`; a given pencil already contains it.
+        boundary: see `assemble`; to be omitted if a pencil is given.
         mass: see `assemble`. With colouring, ``"lumped"`` is 50 to 100 times as fast.
         method: ``"colouring"`` (on grids) applies Chebyshev polynomials to sums of distant point sources, with the same
             vectors for all times. ``"selected-inversion"`` uses a rational approximation with an error of about 1e-10.
@@ -53,8 +53,8 @@ def hks_spectrum_free(
             ``"auto"`` chooses the method with less work. Under `jax.jit`, colouring needs a `Colouring` from
             `colouring`.
         tolerance: a bound on the error of colouring at every node, relative to the smaller of (4πt)^(−d/2) and the
-            largest possible value at a node; with a potential, times exp(−vt), where v is its least value. See
-            `Colouring.error` for proofs. Selected inversion does not use it.
+            largest possible value at a node; with a potential, times exp(−vt), where v is the potential's least value.
+            `Colouring.error` states what is proven. Selected inversion ignores the tolerance.
 
     Raises:
         ValueError: if times, tolerance or method are invalid, if the tolerance is below the rounding error, or a time
@@ -85,9 +85,7 @@ def colouring(
     memory: float = 2e9,
     slack: float = 1.0,
 ) -> Colouring:
-    """Choose spacing and degree from the error bound, for these arguments of `hks_spectrum_free`.
-
-    Values must be concrete.
+    """Choose the spacing of sources and the degree of the expansion for `hks_spectrum_free` from the error bound.
 
     Args:
         memory: the maximum size of the working vectors in bytes, which limits the number of vectors at once.
@@ -131,7 +129,7 @@ def _diagonal(
         return space.extend(scale[:, None] * diagonals)
     values = scale.reshape(-1, *[1] * len(space.node_shape)) * _by_colours(settings, part, times)
     if checked:
-        # Multiplication makes the derivatives NaN as well.
+        # Multiplication by NaN makes the derivatives NaN as well.
         fits = _fits(settings, *jax.lax.stop_gradient((part, times)))
         values = values * nan_outside(jnp.ones_like(values), fits)
     return nan_outside(jnp.where(space.free, values, 0), space.domain)

@@ -68,7 +68,7 @@ def choose_method(pencil: AnyPencil, times: Float[Array, " m"], method: Method, 
 def least_work(pencil: AnyPencil, times: Float[Array, " m"], tolerance: float) -> Colouring | None:
     """Return the colouring if it takes less work than selected inversion, or None.
 
-    If selected inversion needs too much memory, `Unattainable` is raised for a mesh, and where `plan` raises it.
+    `Unattainable` is raised if selected inversion needs too much memory, and the domain is a mesh or `plan` fails.
     """
     of_inversion = work(None, pencil, times)
     affordable = math.isfinite(of_inversion)
@@ -92,7 +92,7 @@ def least_work(pencil: AnyPencil, times: Float[Array, " m"], tolerance: float) -
 
 
 class Unattainable(ValueError):
-    """The error if colouring is not possible, or if selected inversion on a mesh would exceed the memory."""
+    """The error raised if colouring is not possible, or if selected inversion on a mesh needs too much memory."""
 
 
 def plan(
@@ -126,8 +126,8 @@ def plan(
         more = next(i for i, error in enumerate(errors) if error <= (tolerance - rounding) / 2)
         if not more:
             break
-        mass_degree += more  # the upper bound `top` depends slightly on the degree
-    # The value needs five blocks of vectors in memory; derivatives need eight.
+        mass_degree += more  # repeat, because the upper bound `top` depends slightly on the degree
+    # Values need five blocks of vectors in memory, and derivatives need eight.
     columns = int(min(_COLUMNS, max(1, memory // (8 * space.free.size * times.dtype.itemsize))))
     settings = choose(concrete, limits, space, tolerance, mass_degree, columns, eps)
     vectors = settings.n_vectors(space)
@@ -156,7 +156,7 @@ def work(settings: Colouring | None, pencil: AnyPencil, times: Float[Array, " m"
     space = pencil.space
     if settings is None:
         size, d = 2 * times.dtype.itemsize, space.dimension
-        if _FILL[d] * float(space.n_dof) ** (2 - 2 / d) * size > _MEMORY:  # dissection is not needed
+        if _FILL[d] * float(space.n_dof) ** (2 - 2 / d) * size > _MEMORY:  # known without a dissection
             return math.inf
         operations, entries = zip(*(inversion_cost(dissect(part.pattern)) for part in pencil.parts), strict=True)
         if max(entries) * size > _MEMORY:

@@ -23,10 +23,10 @@ T = TypeVar("T")
 def coloured_diagonal(
     settings: Colouring, colours: StaticArray, pencil: NodalPencil, coefficients: Float[Array, "m terms"]
 ) -> Float[Array, "m *shape"]:
-    """Return the diagonal of Σₙ cₙ Tₙ(2A/top − 1) P at the sources, where A = PK, for every row of coefficients.
+    """Return the diagonal of Σₙ cₙ Tₙ(2A/top − 1) P, where P ≈ M⁻¹ and A = PK, for every row c of coefficients.
 
-    The colours (*shape) are 0, 1, …, or −1 for no colour, where the result is 0. The vector of a colour is 1 at its
-    nodes.
+    The colours (*shape) are 0, 1, …, or −1 for no colour, where the result is 0. The vector of a colour is 1 at the
+    nodes of this colour and 0 elsewhere.
     """
     stiffness, solve_mass = _products(settings, pencil)
 
@@ -43,8 +43,8 @@ def coloured_diagonal(
     return _sum_of_blocks(settings, colours, term, start)
 
 
-# y₀ = Pv, y₁ = Ây₀, yₙ₊₁ = 2Âyₙ − yₙ₋₁ with  = 2PK/top − 1, and the result is Σₙ cₙ v∘yₙ. P approximates M⁻¹, and dM⁻¹
-# = −M⁻¹ dM M⁻¹. So the tangents of aₙ = PKyₙ are P(dK yₙ + K dyₙ − dM aₙ), and dy₀ = −P dM y₀.
+# For the vector v of a colour, y₀ = Pv, y₁ = Ây₀, yₙ₊₁ = 2Âyₙ − yₙ₋₁ with Â = 2PK/top − 1; the result is Σₙ cₙ v∘yₙ.
+# For P ≈ M⁻¹ and dM⁻¹ = −M⁻¹ dM M⁻¹, the tangents of aₙ = PKyₙ are P(dK yₙ + K dyₙ − dM aₙ), and dy₀ = −P dM y₀.
 #
 # The transpose with the cotangent g is Clenshaw's recurrence pₙ = P(v∘sₙ) + fₙ Âpₙ₊₁ − pₙ₊₂ from the last n down to 0,
 # where sₙ = Σₜ cₙ(t) g(t), f₀ = 1 and fₙ = 2. The cotangents are
@@ -134,7 +134,7 @@ def _cotangent(
 
 
 def _scaled(top: float, image: Array, y: Array) -> Array:
-    """Return Ây, given y and its image PKy."""
+    """Return Ây = 2PKy/top − y, given y and its image PKy."""
     return (2 / top) * image - y
 
 

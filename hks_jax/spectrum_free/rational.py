@@ -1,6 +1,6 @@
 """The diagonal of exp(−tM⁻¹K)M⁻¹ by rational approximation and selected inversion.
 
-The Carathéodory–Fejér method gives exp(−x) ≈ Re Σ w/(x − z). So the diagonal is about that of Re Σ w (tK − zM)⁻¹.
+With poles z and weights w, exp(−x) ≈ Re Σ w/(x − z). So the diagonal is about the diagonal of Re Σ w (tK − zM)⁻¹.
 """
 
 from functools import lru_cache
@@ -22,12 +22,13 @@ _TERMS, _SAMPLES, _SCALE = 75, 1024, 9.0
 
 @lru_cache(maxsize=8)
 def exponential_poles(pairs: int) -> tuple[Complex[np.ndarray, " p"], Complex[np.ndarray, " p"]]:
-    """Return poles z and weights w with exp(−x) ≈ Re Σ w/(x − z) for all x ≥ 0, one for each conjugate pair.
+    """Return poles z and weights w with exp(−x) ≈ Re Σ w/(x − z) for all x ≥ 0, one pole for each conjugate pair.
 
-    The error falls by the factor 9.289² = 86 with every pair: 1.3e-2, 1e-4, 2e-6, …, 1e-13 for seven. The source is
-    Trefethen, Weideman and Schmelzer, Talbot quadratures and rational approximations (2006), section 4. The half-line
-    is mapped to the unit circle, and the function is expanded in Chebyshev polynomials. The zeros of a singular vector
-    of the Hankel matrix of its coefficients are very close to the poles of the best approximation.
+    The error falls by the factor 9.289² = 86 with every pair: 1.3e-2, 1e-4, 2e-6, …, 1e-13 for seven pairs. This is the
+    Carathéodory–Fejér method of Trefethen, Weideman and Schmelzer, Talbot quadratures and rational approximations
+    (2006), section 4. The half-line is mapped to the unit circle, and the function is expanded in Chebyshev
+    polynomials. The zeros of a singular vector of the coefficients' Hankel matrix are very close to the poles of the
+    best approximation.
     """
     degree = 2 * pairs
     circle = np.exp(2j * np.pi * np.arange(_SAMPLES) / _SAMPLES)
@@ -39,7 +40,7 @@ def exponential_poles(pairs: int) -> tuple[Complex[np.ndarray, " p"], Complex[np
     left, values, right = np.linalg.svd(hankel(coefficients[1 : _TERMS + 1]))
     value, first, last = values[degree], left[::-1, degree], right[degree]
     analytic = np.polyval(coefficients[_TERMS::-1], circle)
-    # The extended approximation is the analytic part minus σ times a quotient of modulus one on the circle.
+    # The extended approximation is the analytic part minus ``value`` times a quotient of modulus one on the circle.
     quotient = np.fft.fft(first, _SAMPLES) / np.fft.fft(last, _SAMPLES)
     extended = analytic - value * circle**_TERMS * quotient
     zeros = np.roots(last)
@@ -65,7 +66,7 @@ def pole_pairs(dtype: Any) -> int:
 def selected_inversion(
     stiffness: PatternedOperator, mass: Operator, times: Float[Array, " m"], dissection: Dissection
 ) -> Float[Array, "m n_dof"]:
-    """Return the diagonal at each time. The dissection is that of K's sparsity pattern, which includes M's pattern."""
+    """Return the diagonal at each time. The dissection belongs to K's sparsity pattern, which includes M's pattern."""
     poles, weights = exponential_poles(pole_pairs(times.dtype))
     complex_type = np.result_type(times.dtype, np.complex64)
 

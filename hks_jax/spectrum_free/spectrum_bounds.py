@@ -19,14 +19,14 @@ _STEPS, _MASS_STEPS = 50, 200
 
 
 class Bounds(NamedTuple):
-    """Bounds for the polynomials of a pencil; for concrete values, NumPy numbers in double precision.
+    """Bounds for the polynomials that approximate a pencil's heat kernel; `plan` converts them to NumPy numbers.
 
-    For each axis, ``reach`` bounds the eigenvalues of D⁻¹ times the couplings of K across the axis; it is the discrete
-    counterpart of 2 gᵃᵃ/h². ``across`` is the least β such that the couplings C of M across the axis satisfy −C ⪯ βM;
-    it is 1 for a constant metric, and 0 if the mass is lumped.
+    Let D have the row sums of M. For each axis, ``reach`` bounds the eigenvalues of D⁻¹ times the couplings of K across
+    the axis; the continuous counterpart is 2 gᵃᵃ/h². ``across`` is the least β such that the couplings C of M across
+    the axis satisfy −C ⪯ βM; β is 1 for a constant metric, and 0 if the mass is lumped.
     """
 
-    top: Any  # an upper bound on the eigenvalues of PK
+    top: Any  # an upper bound on the eigenvalues of PK, where P ≈ M⁻¹
     low: Any  # a lower bound on the eigenvalues of D⁻¹M, where D has the row sums of M; 1 if the mass is lumped
     reach: Float[Array | np.ndarray, " d"]
     across: Float[Array | np.ndarray, " d"]
@@ -61,8 +61,8 @@ def bounds(pencil: Pencil, low: Float[Array, ""], mass_degree: int) -> Bounds:
     offsets = np.array(list(product((-1, 0, 1), repeat=d)))
     measured = entries[None]
     if not nodal.mass.is_diagonal:
-        # M − C has the couplings within the layers of nodes that are perpendicular to the axis. It consists of diagonal
-        # blocks of M and so is positive semidefinite. Then −C = (M − C) − M ⪯ βM, where 1 + β is the greatest
+        # M − C has the couplings within the layers of nodes that are perpendicular to the axis. This matrix consists of
+        # diagonal blocks of M, and so is positive semidefinite. Then −C = (M − C) − M ⪯ βM, where 1 + β is the greatest
         # eigenvalue of M⁻¹(M − C).
         within = (offsets.T == 0).reshape(d, -1, *[1] * d)
         measured = jnp.concatenate([measured, jnp.where(within, nodal.mass.coefficients, 0)])
