@@ -40,7 +40,7 @@ def is_saved_pairs(path: Path) -> bool:
 def write_pairs(path: Path, solved: Solved, image: str, warnings: Sequence[str], fingerprint: str = "") -> None:
     """Write eigenpairs with the volume, whose mask is the domain, and with the settings of their computation.
 
-    The file also contains the suffix of images, the warnings, and the fingerprint of a study's subject.
+    The file also contains the suffix of image files (such as .nii.gz), the warnings, and the fingerprint of a study's subject.
     """
     volume, settings = solved.volume, asdict(solved.settings)
     record = {name: getattr(volume, name) for name in _ABOUT}
@@ -58,7 +58,7 @@ def are_of(path: Path, fingerprint: str) -> bool:
 
 
 def read_pairs(path: Path, settings: Settings, progress: Progress) -> tuple[Solved, str]:
-    """Return saved eigenpairs and the suffix of images; settings in the file replace settings in `settings`."""
+    """Return saved eigenpairs and the suffix of image files; settings in the file replace settings in `settings`."""
     arrays = load_npz(path)
     record: dict[str, Any] = json.loads(str(arrays[_RECORD]))
     about = {name: record[name] for name in _ABOUT if name in record} | {"notes": tuple(record["notes"])}

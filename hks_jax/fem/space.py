@@ -250,7 +250,7 @@ def mask_for(values: Any, mask: Bool[np.ndarray, "*shape"]) -> Bool[np.ndarray |
 
 
 def couplings_for(values: Any, space: GridSpace) -> Bool[np.ndarray | Array, "offsets *shape"] | None:
-    """Return, for each offset and node, whether both coupled nodes are free; ``values`` take part in the computation.
+    """Return, for each offset and node, whether both coupled nodes are free, as a mask for an array ``values``.
 
     The result is None if the values are traced and all nodes of the domain are free.
     """

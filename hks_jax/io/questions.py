@@ -29,7 +29,7 @@ _SAID = "Principal directions differ from the mean direction of their two neighb
 class Alternative(NamedTuple):
     """Alternative axes for the components of a file."""
 
-    name: str  # a frame, or a reversed axis of the voxels or of the scanner
+    name: str  # a frame, or the reversed axis, which belongs to the voxels or to the scanner
     is_frame: bool  # whether `name` is a frame
     angle: float  # the mean angle, in degrees, between a principal direction and the mean direction of its neighbours
     errors: float  # the decrease of `angle` relative to the axes in which the file was read, in standard errors

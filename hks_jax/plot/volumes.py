@@ -196,5 +196,5 @@ def _turned(
     if orientation is not None:
         node = None if node is None else orientation.node(node, grid.shape)
         array, grid = orientation.array(array), orientation.grid(grid)
-    # The middle is determined in the order of the image, so that ties do not depend on the storage order.
+    # The middle node is determined along the axes of the picture, so that ties do not depend on the storage order.
     return array, grid, middle_node(~np.ma.getmaskarray(array)) if node is None else tuple(node)

@@ -98,8 +98,8 @@ def _weighted(contraction: Contraction, weights: Float[Array, "m k"], vectors: F
 #     F = [f]∘G − [λf]∘H,    [f]ᵢⱼ = (f(λᵢ) − f(λⱼ))/(λᵢ − λⱼ),  [f]ᵢᵢ = f'(λᵢ),    [λf]ᵢⱼ = f(λᵢ) + λⱼ [f]ᵢⱼ.
 #
 # F does not depend on the basis chosen for a multiple eigenvalue, and is not singular there. Truncation sets f to zero
-# on all pairs that are not kept. Then F is unchanged among the kept pairs. Between a kept pair i and all other pairs j
-# the entries f(λᵢ) (Gᵢⱼ − λᵢHᵢⱼ)/(λᵢ − λⱼ) add up to
+# on all pairs that are not kept. Then the entries of F between kept pairs do not change. Between a kept pair i and all
+# other pairs j the entries f(λᵢ) (Gᵢⱼ − λᵢHᵢⱼ)/(λᵢ − λⱼ) add up to
 #
 #     Σᵢ f(λᵢ) (φᵢxᵢᵀ + xᵢφᵢᵀ),    xᵢ = (I − ΦΦᵀM) dφᵢ,
 #
