@@ -40,7 +40,7 @@ def is_saved_pairs(path: Path) -> bool:
 def write_pairs(path: Path, solved: Solved, image: str, warnings: Sequence[str], fingerprint: str = "") -> None:
     """Write eigenpairs with the volume, whose mask is the domain, and with the settings of their computation.
 
-    The file also contains the suffix of image files (such as .nii.gz), the warnings, and the fingerprint of a study's subject.
+    The file also contains the suffix of image files (such as .nii.gz), the warnings, and the fingerprint of a subject.
     """
     volume, settings = solved.volume, asdict(solved.settings)
     record = {name: getattr(volume, name) for name in _ABOUT}

@@ -127,8 +127,8 @@ def _complete_below(
 ) -> Float[Array, ""]:
     """Return the bound below which the pairs of all parts are complete.
 
-    A part's certificate may end at its last computed eigenvalue. But if a part already has the largest possible number
-    of pairs up to ``reach``, the part has no further eigenvalue below ``reach``.
+    The certificate of a part may reach only to its last computed eigenvalue. But if a part already has the largest
+    possible number of pairs up to ``reach``, the part has no further eigenvalue below ``reach``.
     """
     bounds = []
     for pairs, limit in zip(solved, _limits(pencil, total), strict=True):

@@ -179,8 +179,8 @@ def _checked_operator(
     named = {name: value for name, value in (("potential", potential), ("density", density)) if value is not None}
     if own and named:
         raise ValueError(
-            f"{', '.join(named)}: got a field with your own form; pass fields={{{next(iter(named))!r}: …}}, and read "
-            "the field in the form"
+            f"{', '.join(named)}: got a field with your own form; pass fields={{{next(iter(named))!r}: …}}, and use "
+            f"w[{next(iter(named))!r}] in the form"
         )
     if (given or components > 1) and not own:
         raise ValueError("fields, components: only a form of your own can use them; pass a form as stiffness= or mass=")

@@ -46,7 +46,7 @@ class NodalPencil(eqx.Module):
         return jnp.where(self.free, self.lumped, 0)
 
     def cut(self, mesh: Mesh | None) -> Slabs | None:
-        """Return the cut of the grid for several devices; None for one device."""
+        """Return how the grid is divided among several devices; None for one device."""
         return None if mesh is None else Slabs(mesh, self.shape, self.periodic)
 
     def own(self, slabs: Slabs | None) -> "NodalPencil":

@@ -106,7 +106,7 @@ class Stencil(eqx.Module):
 
     coefficients: Float[Array, "offsets *shape"]
     periodic: tuple[bool, ...] = eqx.field(static=True)  # for each axis, whether node n is node 0
-    slabs: Slabs | None = eqx.field(default=None, static=True)  # the cut of the grid, if this is one slab of it
+    slabs: Slabs | None = eqx.field(default=None, static=True)  # how the grid is divided, if this is one slab of it
 
     @property
     def is_diagonal(self) -> bool:

@@ -51,9 +51,7 @@ def load(path: str | os.PathLike[str], mark: str) -> Checkpoint:
     lacking = {"mark", *(field.name for field in dataclasses.fields(Checkpoint))} - set(data)
     if lacking:
         names = ", ".join(sorted(lacking))
-        raise ValueError(
-            f"checkpoint: got {path}, which has no {names}; expected a fit's checkpoint. Give the path of another file"
-        )
+        raise ValueError(f"checkpoint: got {path} without {names}; expected a fit's checkpoint. Use another file")
     if str(data["mark"]) != mark:
         raise ValueError(
             f"checkpoint: {path} belongs to another fit (another target, initial field or setting). Use another name, "

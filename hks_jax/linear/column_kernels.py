@@ -1,8 +1,9 @@
 """Kernels for CUDA devices that fuse the operations of block Lanczos on blocks of a few long columns.
 
 With XLA operations, it takes four launches to compute inner products of columns and to combine the columns by them: for
-partial sums, their sum, a small matrix computed from the sum, and the combined columns. In this module, the partial sums are the input of a
-second kernel. Each program of this kernel adds the partial sums, computes the small matrix, and combines its own rows.
+partial sums, their sum, a small matrix computed from the sum, and the combined columns. In this module, the partial
+sums are the input of a second kernel. Each program of this kernel adds the partial sums, computes the small matrix, and
+combines its own rows.
 """
 
 from collections.abc import Callable

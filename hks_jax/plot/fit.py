@@ -63,7 +63,7 @@ def fit_panels(
     if times is None:
         times = fit.problem.observation.times
     if times is None:
-        raise ValueError("times: got None for a fit without times; expected one number per image of the target")
+        raise ValueError("times: got None, and the fit has no times; expected one number for each image in the target")
     wanted, fitted = np.asarray(target, dtype=np.float64), np.asarray(fit.hks, dtype=np.float64)
     t = checked_times(times, grid.shape, **{"target": wanted, "fit.hks": fitted})
     with np.errstate(divide="ignore", invalid="ignore"):

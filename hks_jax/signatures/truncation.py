@@ -286,7 +286,7 @@ def truncation_map(
     `truncation` estimates the mean over the domain. A single node beside a Dirichlet side, in its corners, or where
     tensors vary between nodes can lack several times as much. Here Weyl's law is local: the function N(λ, x) = Σ φᵢ(x)²
     over λᵢ < λ is approximated by N(Λ, x) (λ/Λ)^a(x), where Λ is the first eigenvalue beyond the k pairs. The pairs
-    determine N(Λ, x). The mean of λ at the node, which is Λ a/(a + 1), determines the exponent a(x). The exponent is
+    determine N(Λ, x). The mean of λᵢ with the weights φᵢ(x)² equals Λ a/(a + 1), so it determines a(x). The exponent is
     about d/2 inside and at Neumann sides, and d/2 + 1 at a Dirichlet side.
 
     The result is an estimate, not a bound. On small grids the largest true share of a node was 0.25 to 2 times the

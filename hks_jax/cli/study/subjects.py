@@ -95,7 +95,7 @@ def _label(path: Path, entity: str, text: str) -> str:
 
 
 def _words(folder: Path, row: dict[str, str]) -> tuple[list[str], dict[str, str]]:
-    """Return the options in a row as words of a command line, and the other columns."""
+    """Return a row's options, as words of a command line, and its other columns."""
     words, covariates = [], {}
     if "file" in row:
         words.append(str(folder / row.pop("file")))

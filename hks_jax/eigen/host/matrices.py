@@ -37,7 +37,7 @@ def inertia_on_host(K: csc_matrix, M: csc_matrix, shift: float) -> tuple[int, bo
 
 
 def host_matrices(pencil: SymmetricPencil) -> tuple[tuple[Array, ...], Callable[..., tuple[csc_matrix, csc_matrix]]]:
-    """Return the entries of K, of M and of null vectors, and a function that makes SciPy matrices from these arrays.
+    """Return arrays of K, M and the null vectors of K, and a function that makes SciPy matrices from such arrays.
 
     The matrices are float64. For a null vector v, rounding errors in Kv would act as a potential. These errors are
     subtracted from the diagonal if each node belongs to exactly one null vector.
