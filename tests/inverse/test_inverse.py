@@ -502,7 +502,6 @@ def test_an_array_is_no_place_to_start():
         hj.fit_metric(np.ones((4, N, N)), TIMES, FLAT)
 
 
-@pytest.mark.slow
 def test_solvers_of_optimistix_are_taken_as_they_are():
     solver = optx.BFGS(1e-3, 1e-3)
     target = hj.heat_trace(hj.eigenpairs(CONFORMAL, K), TIMES)
