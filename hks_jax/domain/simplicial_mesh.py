@@ -98,7 +98,9 @@ class SimplicialMesh(eqx.Module):
         if not is_traced((array, edges)):
             _check_tensors(np.asarray(array), np.asarray(edges), triangulation, at_vertices)
         corners = triangulation.cells if at_vertices else np.arange(len(array))[:, None]
-        of_cells = _tangential_metric(edges, array, corners, metric, interpolation if at_vertices else "linear")
+        of_cells = _tangential_metric(
+            edges, spd.symmetrise(array), corners, metric, interpolation if at_vertices else "linear"
+        )
         given = _checked_metric(of_cells, triangulation)  # inverting the tensors may overflow
         return eqx.tree_at(lambda m: m._metric, mesh, given, is_leaf=lambda leaf: leaf is None)
 
@@ -116,8 +118,7 @@ class SimplicialMesh(eqx.Module):
     @property
     def metric(self) -> Float[Array, "n d d"]:
         """The metric of each cell in the basis of its edges v₁ − v₀, v₂ − v₀ …; NaN if not positive definite."""
-        given = self._metric
-        return spd.positive_or_nan(_induced_metric(self._edges) if given is None else given)
+        return _induced_metric(self._edges) if self._metric is None else spd.positive_or_nan(self._metric)
 
     @property
     def _edges(self) -> Float[Array, "n 3 d"]:
@@ -224,28 +225,27 @@ def _tangential_metric(
     xp: Any, edges: Any, tensors: Any, corners: Any, metric: MetricChoice, interpolation: Interpolation
 ) -> Any:
     """Return the metric of cells in the basis of their edges (n, 3, d), from tensors in space at corners (n, c)."""
-    frames, symmetric = _orthonormal(xp, edges), 0.5 * (tensors + xp.swapaxes(tensors, -1, -2))
-    across = xp.swapaxes(frames, -1, -2)
-    parts = matmul(across[:, None], symmetric[corners], frames[:, None])
+    frames = _orthonormal(xp, edges)
+    parts = matmul(frames.mT[:, None], tensors[corners], frames[:, None])
     # The tensors at all vertices of a cell, and not only their mean, must be positive definite.
-    parts = spd.nan_unless(xp, spd.is_positive(parts), parts)
+    parts = spd.nan_unless_positive(xp, parts)
     # The logarithm of the tangential part is used, because the tensor in space may be indefinite.
     mean = xp.mean(parts, axis=1) if interpolation == "linear" else spd.exp(jnp.mean(spd.log(parts), axis=1))
-    coordinates = matmul(across, edges)
-    return matmul(xp.swapaxes(coordinates, -1, -2), spd.metric_of_diffusion(mean, metric), coordinates)
+    coordinates = matmul(frames.mT, edges)
+    return matmul(coordinates.mT, spd.metric_of_diffusion(mean, metric), coordinates)
 
 
 @numpy_where_known()
 def _edges_of(xp: Any, vertices: Any, cells: Any) -> Any:
     """Return the edges v₁ − v₀, v₂ − v₀ … of each cell, as columns; NaN for inverted tetrahedra."""
     corners = vertices[cells]
-    return oriented(xp, xp.swapaxes(corners[:, 1:] - corners[:, :1], -1, -2))
+    return oriented(xp, (corners[:, 1:] - corners[:, :1]).mT)
 
 
 @numpy_where_known()
 def _induced_metric(xp: Any, edges: Any) -> Any:
     """Return the inner products of the edges of each cell."""
-    return matmul(xp.swapaxes(edges, -1, -2), edges)
+    return spd.nan_unless_positive(xp, matmul(edges.mT, edges))
 
 
 def oriented(xp: Any, frames: Any) -> Any:

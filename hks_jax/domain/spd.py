@@ -66,14 +66,18 @@ def metric_of_diffusion(tensors: Any, metric: str) -> Any:
     return tensors if metric == "tensor" else inverse(tensors) if metric == "inverse" else adjugate(tensors)
 
 
-def cholesky(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
-    """Return the lower triangular L with T = LLᵀ for positive semidefinite T. A column is zero if its pivot is zero."""
+def cholesky(tensors: Float[Array, "... d d"], negligible: float | None = None) -> Float[Array, "... d d"]:
+    """Return the lower triangular L with T = LLᵀ; NaN for matrices that are not positive definite.
+
+    For positive semidefinite T, a pivot up to ``negligible`` times its entry Tⱼⱼ makes the column of the pivot zero.
+    """
     factor = jnp.zeros_like(tensors)
     for j in range(tensors.shape[-1]):
         column = tensors[..., j] - jnp.sum(factor * factor[..., j, None, :], axis=-1)
-        zero = (column[..., j] <= 1e-12 * tensors[..., j, j])[..., None]
-        column = column / jnp.sqrt(jnp.where(zero, 1, column[..., j, None]))
-        factor = factor.at[..., j:, j].set(jnp.where(zero, 0, column)[..., j:])
+        pivot = column[..., j, None]
+        zero = False if negligible is None else pivot <= negligible * tensors[..., j, j, None]
+        column = jnp.where(zero, 0, column) / jnp.sqrt(jnp.where(zero, 1, pivot))
+        factor = factor.at[..., j:, j].set(column[..., j:])
     return factor
 
 
@@ -90,16 +94,18 @@ def is_positive(t: Any) -> Any:
     return (t[..., 0, 0] > 0) & (determinant(t[..., :2, :2]) > 0) & (determinant(t) > 0)
 
 
-@numpy_where_known()
-def positive_or_nan(xp: Any, tensors: Any) -> Any:
-    """Return the matrices, d = 2 or 3, with NaN in place of matrices that are not positive definite."""
-    return nan_unless(xp, is_positive(tensors), tensors)
-
-
 # A product with NaN, unlike `where(…)`, makes the derivatives NaN, too.
 def nan_unless(xp: Any, valid: Any, matrices: Any) -> Any:
     """Return the matrices (..., i, j) of JAX or NumPy, with NaN in place of matrices that are not ``valid``."""
     return matrices * xp.where(valid, 1, xp.nan).astype(matrices.dtype)[..., None, None]
+
+
+def nan_unless_positive(xp: Any, tensors: Any) -> Any:
+    """Return the matrices of JAX or NumPy, d = 2 or 3, with NaN in place of those that are not positive definite."""
+    return nan_unless(xp, is_positive(tensors), tensors)
+
+
+positive_or_nan = numpy_where_known()(nan_unless_positive)
 
 
 # If tr S = 0, the Cayley–Hamilton theorem gives S² = qI (d = 2) or S³ = pS + |S| I (d = 3). So exp S is a

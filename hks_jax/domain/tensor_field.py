@@ -221,7 +221,7 @@ class TensorField(eqx.Module):
 @numpy_where_known(static_argnums=1)
 def _metric_of_diffusion(xp: Any, D: Any, metric: MetricChoice) -> Any:
     # In three dimensions −D and D have the same adjugate, so tensors that are not positive definite become NaN first.
-    return spd.metric_of_diffusion(spd.nan_unless(xp, spd.is_positive(D), D), metric)
+    return spd.metric_of_diffusion(spd.nan_unless_positive(xp, D), metric)
 
 
 def _evaluate(function: jtu.Partial, grid: Grid) -> Float[Array, "*shape_and_components"]:

@@ -203,7 +203,7 @@ class TensorNoise(eqx.Module):
             kernels = [jnp.asarray(each, white.dtype) for each in gaussians(self.grid, self.correlation)]
             white = along_axes(kernels, white)
         if self.modes is None:
-            root = spd.cholesky(jnp.asarray(self.covariance)).astype(white.dtype)
+            root = spd.cholesky(jnp.asarray(self.covariance), negligible=1e-12).astype(white.dtype)
             parts = jnp.einsum("...ab,...b->...a", root, white, precision="highest")
         else:
             parts = jnp.einsum("...na,n->...a", self.modes.astype(white.dtype), white, precision="highest")

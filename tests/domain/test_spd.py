@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fields import random_spd
 from scipy.linalg import expm, expm_frechet
 
 from hks_jax.domain import spd
@@ -71,3 +72,13 @@ def test_second_derivatives_where_eigenvalues_are_equal():
 def test_no_logarithm_of_what_is_not_positive_definite():
     for bad in (-jnp.eye(2), jnp.asarray([[1.0, 2.0], [2.0, 1.0]]), -jnp.eye(3), jnp.diag(jnp.asarray([1.0, -1, -1]))):
         assert np.isnan(spd.log(bad)).any()
+
+
+def test_cholesky_factors_of_definite_and_semidefinite_matrices(rng):
+    t = jnp.asarray(random_spd(rng, (4, 5, 6)))
+    np.testing.assert_allclose(spd.cholesky(t), np.linalg.cholesky(t), atol=1e-14)
+    thin, indefinite = jnp.diag(jnp.array([1.0, 1e-14])), jnp.array([[1.0, 2.0], [2.0, 1.0]])
+    np.testing.assert_allclose(spd.cholesky(thin), jnp.sqrt(thin), rtol=1e-14)
+    assert np.isnan(spd.cholesky(indefinite)).any()
+    root = spd.cholesky(jnp.ones((2, 2)), negligible=1e-12)
+    np.testing.assert_array_equal(root, [[1, 0], [1, 0]])
