@@ -56,10 +56,10 @@ def eigenpairs(
             concrete values, ``"shift-invert"`` works too. For an interval, derivatives use only the tolerance of the
             solver's ``adjoint``.
         mass: ``"consistent"`` or ``"lumped"``. This argument applies only to fields and meshes.
-        multiplet: the treatment of a multiple eigenvalue of which only some pairs are among the k lowest; unused with
-            an interval. ``"report"`` warns. ``"drop"`` excludes these pairs from every signature. ``"complete"``
-            computes 8 more pairs and includes the missing pairs, or drops the eigenvalue if 8 pairs are too few.
-            ``.kept`` marks the included pairs.
+        multiplet: the treatment of a multiple eigenvalue that k cuts, so that only some of its pairs are among the k
+            lowest; unused with an interval. ``"report"`` warns. ``"drop"`` excludes these pairs from every signature.
+            ``"complete"`` computes 8 more pairs and includes the missing pairs, or drops the eigenvalue if 8 pairs are
+            too few. ``.kept`` marks the included pairs.
         throw: whether to raise an error if ``.result`` is not successful or derivatives do not converge; under `jit`, a
             callback to the host raises the error. Without ``throw``, ``.result`` has the error's code, derivatives that
             did not converge are NaN, and concrete values cause a warning.

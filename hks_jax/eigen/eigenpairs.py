@@ -151,7 +151,7 @@ class Eigenpairs(eqx.Module):
 
     @property
     def cut_multiplet(self) -> Array:
-        """The number of kept pairs of a multiple eigenvalue of which other pairs are not kept; 0 if there is none."""
+        """The number of kept pairs of the multiple eigenvalue that the cut divides; 0 if the cut divides none."""
         known = self.eigenvalues, self.kept, self.next_eigenvalue, self.spectral_origin, self.multiplet_tolerance
         return _cut_multiplet(*jax.lax.stop_gradient(known)) if self.k else jnp.zeros((), int)
 

@@ -133,7 +133,8 @@ def assemble(
         if domain._tensors is not None and domain._tensors.ndim > domain.grid.dimension + 2:
             raise ValueError("domain: got a batch of tensor fields; expected one field. Map over the batch by jax.vmap")
         if degree != 1 or midpoints is not None:
-            raise ValueError("degree, midpoints: got one of them for a grid, whose elements are Q1; leave both out")
+            got = f"degree {degree!r} and {'no' if midpoints is None else 'some'} midpoints"
+            raise ValueError(f"degree, midpoints: got {got} for a grid, whose elements are Q1; leave both out")
         sides = normalise_boundary(boundary, domain.grid.dimension)
         if components > 1 and any("mirror" in pair for pair in sides):
             raise ValueError('boundary: got "mirror" with components; only scalar functions support "mirror"')

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from hks_jax.arrays import jax_array
 from hks_jax.fem.fields import Field
 from hks_jax.fem.forms import WeakForm
 from hks_jax.fem.resolution import Resolution, SampledMetric, resolution_of
@@ -213,7 +214,7 @@ def _constants(space: FunctionSpace, values: Array) -> NullSpace:
     else:
         number = numbers.arange(n_null, dtype=np.int32)[:, None]
         vectors = (numbers.asarray(labels, np.int32) == number).astype(values.dtype)
-    return NullSpace(jnp.asarray(vectors) if is_staged() else jax.device_put(vectors), fixed=True)
+    return NullSpace(jax_array(vectors), fixed=True)
 
 
 def gathered(space: MeshSpace | VectorSpace, matrices: Float[Array, "E m m"]) -> SparseOperator:

@@ -28,7 +28,7 @@ from hks_jax.linear.pencil import NullSpace, SymmetricPencil
 from hks_jax.traced import is_traced
 
 _FEW = 8
-"""The largest number of null vectors of which every vector is checked."""
+"""Up to this number, all null vectors are checked."""
 
 
 class _Entries(NamedTuple):

@@ -82,7 +82,7 @@ def identifiability(
         n_weak: the number of weak directions.
         noise: σ, the standard deviation of each entry's residual before weighting (0.01 for 1 % under ``"log"``).
         prior: τ, the prior standard deviation of every single unknown, in the units of the parametrisation.
-        iterations: the number of subspace iterations, each of which takes n + 8 products with J and n + 8 with Jᵀ.
+        iterations: the number of subspace iterations. An iteration takes n + 8 products with J and n + 8 with Jᵀ.
         seed: the seed of the random initial subspace.
 
     Raises:

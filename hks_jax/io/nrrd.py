@@ -99,12 +99,13 @@ def _check_header(text: bytes, header: Mapping[str, Any]) -> None:
 
     Without this check, a field with a damaged name would be ignored and have its default, such as a spacing of 1.
     """
+    fields = _FIELDS.split(", ")
     for line in text.splitlines()[1:]:
         if line.startswith(b"#") or not line:
             continue
         key, colon, value = line.partition(b":")
         name, is_key = key.decode("latin-1"), value.startswith(b"=")
-        if not colon or (name in _FIELDS.split(", ")) == is_key or (not is_key and not line.isascii()) or b"\0" in line:
+        if not colon or (name in fields) == is_key or (not is_key and not line.isascii()) or b"\0" in line:
             raise ValueError(f"got the header line {line[:60]!r}; expected a field of the format, or a key and a value")
     n = int(header["dimension"])
     for name in _PER_AXIS:

@@ -54,7 +54,7 @@ def hks_spectrum_free(
             `colouring`.
         tolerance: a bound on the error of colouring at every node, relative to the smaller of (4πt)^(−d/2) and the
             largest possible value at a node; with a potential, times exp(−vt), where v is the potential's least value.
-            `Colouring.error` states what is proven. Selected inversion ignores the tolerance.
+            `Colouring.error` contains the proven bound. Selected inversion ignores the tolerance.
 
     Raises:
         ValueError: if times, tolerance or method are invalid, if the tolerance is below the rounding error, or a time

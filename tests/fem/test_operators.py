@@ -366,7 +366,7 @@ def first_order(u, v, w):
         ({"mass": "full"}, 'mass: got \'full\'; expected "consistent", "lumped" or a form'),
         ({"fields": {"a": 1.0}}, "only a form of your own can use them"),
         ({"stiffness": elasticity, "components": 2, "boundary": "mirror"}, 'got "mirror" with components'),
-        ({"degree": 2}, "degree, midpoints: got one of them for a grid"),
+        ({"degree": 2}, "degree, midpoints: got degree 2 and no midpoints for a grid"),
     ],
 )
 def test_bad_operators_are_refused(settings, message):
