@@ -373,6 +373,7 @@ def test_the_command_line_keeps_what_it_compiled_and_the_package_nothing(npz, tm
 
 
 def test_module_runs_in_a_process_of_its_own(npz, tmp_path):
+    out = tmp_path / os.fsdecode("λ".encode() + b"\xff")  # printed in ASCII, and invalid in UTF-8
     command = [
         sys.executable,
         "-m",
@@ -380,16 +381,21 @@ def test_module_runs_in_a_process_of_its_own(npz, tmp_path):
         "hks",
         str(npz),
         "-o",
-        str(tmp_path / "out"),
+        str(out),
         "-k",
         "10",
         "--times",
         "1",
+        "--dtype",
+        "float32",
     ]
-    done = subprocess.run([*command, "--dtype", "float32"], capture_output=True, text=True, timeout=300, check=False)
+    ascii_only = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=ascii_only)
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
-    with np.load(tmp_path / "out" / "hks.npz") as read:
+    assert "\\u03bb\\udcff/hks.npz\n" in done.stdout
+    assert str(out) in json.loads((out / "report.json").read_text())["command"]
+    with np.load(out / "hks.npz") as read:
         assert read["hks"].dtype == np.float32  # with 64 bits off, not merely cast
         assert read["eigenvalues"].dtype == np.float32
 
@@ -460,6 +466,7 @@ def test_paper_passes_its_flags_on(tmp_path, monkeypatch, capsys):
         (["-k", "5000"], ["k: got 5000", "number of degrees of freedom"]),
         (["--times", "0", "1"], ["--times", "'0 1'", "expected positive numbers, or auto"]),
         (["--times", "auto:no"], ["--times", "auto:N"]),
+        (["-o", 300 * "a"], ["--output", "name too long", "Choose another folder"]),
         (["--slice", "14"], ["--slice", "such as z=14"]),
         (["--slice", "z=1"], ["slice", "expected a volume with three axes"]),
         (["--boundary", "robin"], ["boundary: got 'robin'", "'neumann'"]),
@@ -603,7 +610,7 @@ def test_parsing():
     assert parse_boundary("neumann:dirichlet") == (("neumann", "dirichlet"),)
 
 
-def test_progress_is_silent_when_quiet_but_for_warnings(capsys):
+def test_progress_is_silent_when_quiet_but_for_warnings(capsys, monkeypatch):
     progress = Progress(quiet=True)
     with progress.stage("work"):
         progress.update("half")
@@ -613,6 +620,8 @@ def test_progress_is_silent_when_quiet_but_for_warnings(capsys):
     assert capsys.readouterr().err == "warning: mind this\n"
     assert progress.warnings == ["mind this"]
     assert progress.timings["work"] > 0
+    monkeypatch.setattr("sys.stderr", None)  # closed, as for programs without a console
+    Progress().note("by the way")
 
 
 def test_a_bar_and_the_time_left_on_a_terminal(monkeypatch):

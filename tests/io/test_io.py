@@ -431,13 +431,15 @@ def test_an_interrupt_leaves_nothing(tmp_path):
     assert not (tmp_path / "a").exists()
 
 
-def test_a_folder_replaces_its_own_files_only(tmp_path):
+def test_a_folder_replaces_its_own_files_only(tmp_path, monkeypatch):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "old").write_text("kept")
     (tmp_path / "out" / "file").write_text("replaced")
-    with atomic_folder(tmp_path / "out") as temporary:
+    monkeypatch.chdir(tmp_path / "out")
+    with atomic_folder(".") as temporary:
         (temporary / "file").write_text("new")
         assert (tmp_path / "out" / "file").read_text() == "replaced"
+        assert temporary.resolve().parent == tmp_path / "out"  # the parent may be on another drive
     assert {f.name: f.read_text() for f in (tmp_path / "out").iterdir()} == {"old": "kept", "file": "new"}
     assert [f.name for f in tmp_path.iterdir()] == ["out"]
     with pytest.raises(NotADirectoryError, match="got a file"), atomic_folder(tmp_path / "out" / "old"):
