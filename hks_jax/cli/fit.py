@@ -28,7 +28,7 @@ from hks_jax.fem.boundary import unreached_sides
 from hks_jax.io import read_tensors, save, save_tensors
 from hks_jax.io.formats import format_of
 from hks_jax.io.result import Result, plain, tuples
-from hks_jax.io.volume import digest
+from hks_jax.io.volume import TensorVolume, digest, require_position
 
 OPTIONS = f"""
 target TARGET  the signature, an .npz file
@@ -82,7 +82,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         target = Result.read(args.target, "hks", over_times=True)
         # The mask is the domain of the computed signature, so all of its components belong to the domain.
         grid = target.grid
-        init = _initial(args, grid, progress)
+        init = _initial(args, target.volume, grid, progress)
         if args.boundary is None:
             recorded = tuples(target.settings.get("boundary"))
             args.boundary = recorded or "neumann"
@@ -128,7 +128,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     return _write(args, fit, target, report, progress)
 
 
-def _initial(args: argparse.Namespace, grid: Grid, progress: Progress) -> TensorField:
+def _initial(args: argparse.Namespace, target: TensorVolume, grid: Grid, progress: Progress) -> TensorField:
     if args.init is None:
         unit = np.eye(grid.dimension, dtype=args.dtype)
         return TensorField(grid, np.broadcast_to(unit, (*grid.shape, *unit.shape)), args.interpolation)
@@ -140,6 +140,7 @@ def _initial(args: argparse.Namespace, grid: Grid, progress: Progress) -> Tensor
         raise ValueError(
             f"--init: got tensors of shape {volume.shape}; expected the target's shape {grid.shape}. {remedy}"
         )
+    require_position("--init", volume.affine, target.affine, target.volume_shape, of="the target")
     if not np.allclose(volume.spacing, grid.spacing, rtol=1e-4):
         progress.warn(f"--init: got the spacing {volume.spacing}; using the spacing of the target, {grid.spacing}")
     if lacking := int((grid.inside & ~volume.inside).sum()):

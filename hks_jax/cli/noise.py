@@ -19,6 +19,7 @@ from hks_jax.cli.reading import read_volume
 from hks_jax.cli.values import Times
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result
+from hks_jax.io.volume import require_position
 
 _CANDIDATES = 4
 """The number of candidate times for each automatic time."""
@@ -113,7 +114,9 @@ def noise_of_volume(
     if args.noise == "roughness":
         return hj.TensorNoise.from_roughness(volume.tensors, grid)
     if (second := second_scan(args)) is not None:
-        return hj.TensorNoise.from_scans(volume.tensors, read_volume(second, progress).tensors, grid)
+        other = read_volume(second, progress)
+        require_position(args.noise, other.affine, volume.affine, volume.volume_shape)
+        return hj.TensorNoise.from_scans(volume.tensors, other.tensors, grid)
     return hj.TensorNoise.relative(volume.tensors, float(args.noise), grid)
 
 

@@ -212,6 +212,11 @@ class TensorVolume:
         return affine
 
     @property
+    def volume_shape(self) -> tuple[int, ...]:
+        """The shape as a volume, in which a slice is one voxel thick."""
+        return self.shape if self.dimension == 3 else tuple(np.insert(self.shape, self.thin_axis, 1).tolist())
+
+    @property
     def thin_axis(self) -> int:
         """The axis along which a slice is one voxel thick when it is written as a volume; z by default."""
         return 2 if self.slice_axis is None else self.slice_axis
@@ -240,6 +245,18 @@ def corners(shape: tuple[int, ...]) -> Int[np.ndarray, "8 4"]:
     """Return the homogeneous indices (i, j, k, 1) of the voxels at the corners of an image in 2D or 3D."""
     ends = ((0, n - 1) for n in (*shape, 1)[:3])
     return np.stack(np.meshgrid(*ends, [1], indexing="ij"), -1).reshape(-1, 4)
+
+
+def require_position(name: str, affine: Any, expected: Any, shape: tuple[int, ...], of: str = "the tensors") -> None:
+    """Raise ValueError if the affine of an image displaces its voxels from `expected`; an affine None is unknown."""
+    if affine is None or expected is None:
+        return
+    shift = np.linalg.norm(corners(shape) @ (affine - expected).T, axis=1).max()
+    if shift > 0.5 * np.linalg.norm(expected[:3, :3], axis=0).min():
+        raise ValueError(
+            f"{name}: the affine displaces this image by up to {shift:.3g} from {of}; expected the same position. "
+            f"Resample the image to the voxels of {of}"
+        )
 
 
 def images_of(array: np.ndarray, volume: TensorVolume) -> np.ndarray:

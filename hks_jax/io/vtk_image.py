@@ -121,9 +121,9 @@ def _store(path: Path, arrays: dict[str, np.ndarray], volume: TensorVolume, reco
 
     affine = volume.volume_affine
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
-    shape = np.array(volume.shape) if volume.dimension == 3 else np.insert(volume.shape, volume.thin_axis, 1)
+    shape = volume.volume_shape
     image = vtkImageData()
-    image.SetDimensions(*shape.tolist())
+    image.SetDimensions(*shape)
     image.SetSpacing(*spacing.tolist())
     image.SetOrigin(*affine[:3, 3].tolist())
     image.SetDirectionMatrix(*(affine[:3, :3] / spacing).ravel().tolist())

@@ -784,6 +784,7 @@ def test_an_interrupted_fit_writes_the_best_so_far(conformal, tmp_path, capsys, 
         ([], {"hks": np.nan}, ["target: got 1 of 546 observed values that are NaN", "(2, 3, 4)"]),
         (["--init", "init.npz"], {}, ["--init: got tensors of shape (14, 12)", "the target's shape (14, 13)"]),
         (["--init", "volume.npz"], {}, ["shape (5, 4, 3)", "hks-jax convert volume.npz slice.npz --slice"]),
+        (["--init", "moved.npz"], {"affine": np.eye(4)}, ["--init: the affine displaces", "up to 3 from the target"]),
         (["--metric", "inverse"], {}, ["--metric", "--init"]),
         (["--init", "init.nii.gz"], {}, ["--metric: choose"]),
         (["--init", "init.nrrd"], {}, ["--metric: choose"]),
@@ -799,6 +800,8 @@ def test_fit_errors_are_one_line_and_leave_nothing(conformal, tmp_path, capsys, 
     write_target("target.npz", values, **changes)
     np.savez("init.npz", tensors=metric())
     np.savez("volume.npz", tensors=np.broadcast_to(np.eye(3), (5, 4, 3, 3, 3)))
+    moved = np.eye(4) + 3.0 * np.eye(4)[:, [3, 0, 1, 2]] * [0, 0, 0, 1]
+    np.savez("moved.npz", tensors=np.tile(np.eye(2), (*FIT_GRID.shape, 1, 1)), affine=moved)
     before = sorted(tmp_path.iterdir())
     assert one_error(capsys, main(["fit", "target.npz", "-o", "out", *arguments]), *words) == 2
     assert sorted(tmp_path.iterdir()) == before
@@ -847,10 +850,20 @@ def test_the_rim_of_a_mask_is_no_signal(tmp_path):
 
 
 def test_error_bars_are_refused_where_there_are_none(npz, tmp_path, capsys):
-    for words, text in (
-        (["--noise", "residuals"], "--noise: got residuals, which need a fit"),
-        (["--noise", "0.1", "--method", "auto"], "--noise: got --method auto; expected spectral"),
-        (["--noise", str(tmp_path / "absent.npz")], "absent.npz"),
+    tensors, moved = np.tile(np.eye(3), (4, 4, 4, 1, 1)), np.eye(4)
+    moved[0, 0], moved[0, 3] = -1.0, 3.0  # the same voxels, stored from right to left
+    volume, mirrored = tmp_path / "volume.npz", str(tmp_path / "mirrored.npz")
+    np.savez(volume, tensors=tensors, affine=np.eye(4))
+    np.savez(mirrored, tensors=tensors + np.eye(3), affine=moved)
+    for file, words, text in (
+        (npz, ["--noise", "residuals"], "--noise: got residuals, which need a fit"),
+        (npz, ["--noise", "0.1", "--method", "auto"], "--noise: got --method auto; expected spectral"),
+        (npz, ["--noise", str(tmp_path / "absent.npz")], "absent.npz"),
+        (
+            volume,
+            ["--slice", "x=2", "-k", "4", "--noise", mirrored],
+            "displaces this image by up to 1 from",
+        ),
     ):
-        assert main(["hks", str(npz), "-o", str(tmp_path / "out"), "--metric", "inverse", "-q", *words]) != 0
+        assert main(["hks", str(file), "-o", str(tmp_path / "out"), "--metric", "inverse", "-q", *words]) != 0
         assert text in capsys.readouterr().err

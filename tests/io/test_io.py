@@ -300,7 +300,7 @@ def test_bad_masks(tmp_path, volume):
     elsewhere = volume.affine.copy()
     elsewhere[0, 3] += 2.0
     write_components(tmp_path / "m.nii", volume.mask.astype(np.uint8), elsewhere)
-    with pytest.raises(ValueError, match="displaces it by up to 2 from"):
+    with pytest.raises(ValueError, match="displaces this image by up to 2 from"):
         hj.io.read_tensors(tmp_path / "t.nii", mask=tmp_path / "m.nii")
     np.savez(tmp_path / "m.npz", inside=volume.mask)
     with pytest.raises(ValueError, match="got the arrays inside; expected an array 'mask'"):

@@ -262,5 +262,5 @@ def test_masks(tmp_path, volume):
     np.testing.assert_array_equal(read_mask(tmp_path / "m.nrrd", volume.affine), volume.mask)
     header["space origin"] = ORIGIN
     nrrd.write(str(tmp_path / "m.nrrd"), volume.mask.astype(np.uint8), header, index_order="F")
-    with pytest.raises(ValueError, match="the mask's affine displaces it"):
+    with pytest.raises(ValueError, match="the affine displaces this image"):
         read_mask(tmp_path / "m.nrrd", volume.affine)

@@ -70,7 +70,7 @@ def test_masks_and_labels_that_lost_the_unit_lie_where_the_tensors_do(tmp_path):
             read_labels(tmp_path / "m.nii", twice)
     image.header.set_xyzt_units("meter")
     nib.save(image, tmp_path / "m.nii")
-    with pytest.raises(ValueError, match="the mask's affine displaces it"):
+    with pytest.raises(ValueError, match="the affine displaces this image"):
         read_mask(tmp_path / "m.nii", read.affine)
 
 
@@ -86,7 +86,7 @@ def test_labels_in_two_dimensions_lie_in_the_plane_of_the_slice(tmp_path, axis):
         with pytest.raises(ValueError, match="put the labels and the image on different voxels"):
             read_labels(tmp_path / "m.nii", on)
     nib.save(nib.Nifti1Image((values > 3).astype(np.uint8), affine), tmp_path / "m.nii")
-    with pytest.raises(ValueError, match="the mask's affine displaces it"):
+    with pytest.raises(ValueError, match="the affine displaces this image"):
         read_mask(tmp_path / "m.nii", read.affine)
 
 
