@@ -158,12 +158,13 @@ def _write(args: argparse.Namespace, fit: Any, target: Result, report: dict[str,
     from hks_jax.plot.signature import placed
 
     volume = replace(target.volume, tensors=np.asarray(fit.field.domain_tensors), order="matrix", frame="voxel")
-    volume = replace(volume, source=str(args.target), digest=digest(args.target), notes=())
+    volume = replace(volume, source=str(args.target), digest=digest(args.target), notes=(), unit="")
     history = {"losses": "loss", "misfits": "misfit", "stages": "stage", "starts": "start"}
     columns = {name: np.array([getattr(step, of) for step in fit.history]) for name, of in history.items()}
     with writing(args.output, report, progress, lambda: [args.output / "fit.png"]) as (folder, done):
         origin, extra = {"command": sys.argv, "settings": report["settings"]}, {"times": target.times, **columns}
-        save_tensors(folder / "tensors.npz", volume, provenance=origin)
+        metric = replace(volume, length_unit="")  # reading asks about the unit of diffusivity if lengths are in mm
+        save_tensors(folder / "tensors.npz", metric, provenance=origin)
         save(folder / "fit.npz", np.asarray(fit.hks), volume, name="hks", extra=extra, provenance=origin)
         if volume.dimension == 2:
             figure = fit_panels(fit, target.values, target.times, orientation=placed(volume, None, args.view))

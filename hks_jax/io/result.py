@@ -195,14 +195,13 @@ class Result:
     def unit(self) -> str:
         """The unit of t: seconds for the metric D⁻¹ of tensors in mm²/s and lengths in mm; empty if it is not known."""
         place = self.place
-        known = isinstance(place, TensorVolume) and (place.order == "fit" or (place.unit and place.length_unit == "mm"))
+        known = isinstance(place, TensorVolume) and place.unit and place.length_unit == "mm"
         return "s" if known and self.settings.get("metric") == "inverse" else ""
 
     @property
     def length_unit(self) -> str:
-        """The unit of lengths: mm for a volume with an affine, empty for a mesh, otherwise the volume's unit."""
-        place = self.place
-        return "" if not isinstance(place, TensorVolume) else place.length_unit if place.affine is None else "mm"
+        """The unit of lengths: the volume's unit, or empty for a mesh."""
+        return getattr(self.place, "length_unit", "")
 
 
 def signature_file(result: Path) -> Path:

@@ -85,6 +85,9 @@ def _read_tensors(name: str, order: str | None, frame: str | None, array: str | 
     volume = placed(name, found, frame or "world", affine, mask=inside, length_unit="")
     if np.array_equal(affine[:3, :3], np.diag(volume.spacing)):
         volume = replace(volume, affine=None, origin=tuple(affine[:3, 3].tolist()))
+    else:
+        note = "VTK does not name the axes of space; pictures take them as right, anterior and superior"
+        volume = replace(volume, notes=(*volume.notes, note))
     return _as_plane(volume)
 
 

@@ -574,6 +574,7 @@ def test_results_come_back_as_they_were_saved(tmp_path, rng, times):
     affine = np.array([[0, -2.0, 0, 5], [2.0, 0, 0, -3], [0, 0, -3.0, 1], [0, 0, 0, 1]])
     tensors, mask = np.broadcast_to(np.diag([1.0, 2.0]), (6, 5, 2, 2)), rng.random((6, 5)) < 0.9
     about = {"order": "fit", "notes": ("fitted",), "source": "dwi.nii", "digest": "0f"}
+    about |= {"length_unit": "mm", "unit": "mm²/s"}
     volume = TensorVolume(tensors, (2.0, 3.0), (1.0, 0.0), mask, affine, 1, **about)
     values = np.where(mask, rng.random((max(times.size, 1), 6, 5)), np.nan)
     settings = {"metric": "inverse", "normalisation": "flat", "boundary": (("neumann", "mean"), "periodic")}
@@ -587,7 +588,9 @@ def test_results_come_back_as_they_were_saved(tmp_path, rng, times):
     for name in ("tensors", "mask", "affine", "spacing", "origin", "slice_axis", *about):
         np.testing.assert_array_equal(getattr(read.volume, name), getattr(volume, name))
     assert tuples(read.settings["boundary"]) == settings["boundary"]
-    assert read.unit == "s"
+    assert (read.unit, read.length_unit) == ("s", "mm")
+    bare = replace(volume, length_unit="", unit="")  # an affine alone, such as of VTK's files, declares no unit
+    assert (replace(result, place=bare).unit, replace(result, place=bare).length_unit) == ("", "")
     if times.size:
         assert repr(read) == f"Result(hks: float64 (2, 6, 5), 2 times 1 … 2.5 s, source='{tmp_path / 'hks.npz'}')"
         np.testing.assert_allclose(read.z, (values - 1) / (0.1 + values))
