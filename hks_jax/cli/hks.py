@@ -34,7 +34,7 @@ from hks_jax import SurfaceMesh, TensorNoise, TetMesh, assemble
 from hks_jax.cli import pairs as saved_pairs
 from hks_jax.cli.info import describe_mesh
 from hks_jax.cli.job import Settings, compute_pairs, result_of, solve, use_dtype
-from hks_jax.cli.noise import Noisy, noise_of_volume, require_spectral, signature_of, with_error_bars
+from hks_jax.cli.noise import Noisy, check_noise, noise_of_volume, signature_of, with_error_bars
 from hks_jax.cli.options import READING, SOLVING, options_in, refuse
 from hks_jax.cli.outputs import PAIRS, Done, of_earlier, write_outputs
 from hks_jax.cli.progress import Progress
@@ -72,11 +72,11 @@ _NO_NOISE = "this option needs tensors, which eigenpairs and meshes with the met
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
+    check_noise(args)
     if is_mesh(args.file):
         return _on_mesh(args, Settings.of(args, metric=args.metric), progress)
     refuse(args, ("clean", "inside"), "this option is for meshes; for tensors on a grid, see --repair and --mask")
     refuse(args, ("tensors",), "this option is for a mesh inside a volume; leave it out for the volume itself")
-    require_spectral(args)
     if saved := not args.others and saved_pairs.is_saved_pairs(args.file):
         refuse(args, ("noise",), _NO_NOISE)
         settled = [option.name for option in options_in(f"@metric {READING} {SOLVING}")]
@@ -94,14 +94,17 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         volume, image = read_volume(args, progress), format_of(args.file).image
     if volume.dimension == 2:
         refuse(args, ("through",), "this option is for a volume; leave it out for a slice")
+    noise = None
     if not saved:
+        use_dtype(args.dtype)
+        noise = noise_of_volume(args, volume, volume.grid(args.components), progress)  # may fail, so it comes first
         solved = compute_pairs(volume, settings, progress)
     if args.save_pairs:  # before later steps, which may fail
         with progress.stage("writing", str(args.output / PAIRS)):
             for file in of_earlier(args.output, np.asarray(solved.pairs.eigenvalues), progress):
                 file.unlink(missing_ok=True)
             saved_pairs.write_pairs(args.output / PAIRS, solved, image, progress.warnings)
-    result = signature_of(args, solved, progress)
+    result = signature_of(args, solved, noise, progress)
     drawing = partial(signature_panels, result, view=args.view, through=args.through)
     done = write_outputs(args.output, result, progress, drawing, image)
     return done._replace(files=[*done.files, *[args.output / PAIRS] * args.save_pairs])
@@ -171,10 +174,9 @@ def _read_domain(args: argparse.Namespace, progress: Progress) -> tuple[SurfaceM
             tensors[at] = sample_tensors(replace(volume, tensors=np.asarray(values)), np.asarray(mesh.vertices)[at])
             return domain(tensors)
 
-        if args.noise is None:
-            return sampled(volume.tensors), None
         noise = noise_of_volume(args, volume, volume.grid("all"), progress)
-        return sampled(volume.tensors), Noisy(volume.tensors, noise, sampled, traceable=False)
+        noisy = None if noise is None else Noisy(volume.tensors, noise, sampled, traceable=False)
+        return sampled(volume.tensors), noisy
     if not args.array:
         return kind(vertices, cells, mask=inside), None
     arrays = read_mesh_arrays(args.file, clean=args.clean)

@@ -849,7 +849,8 @@ def test_the_rim_of_a_mask_is_no_signal(tmp_path):
     assert noise["signal_to_noise"][2] is noise["exceeds_2_from_t"] is None
 
 
-def test_error_bars_are_refused_where_there_are_none(npz, tmp_path, capsys):
+def test_error_bars_are_refused_where_there_are_none(npz, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("hks_jax.cli.hks.compute_pairs", None)  # which may take hours, so errors come before it
     tensors, moved = np.tile(np.eye(3), (4, 4, 4, 1, 1)), np.eye(4)
     moved[0, 0], moved[0, 3] = -1.0, 3.0  # the same voxels, stored from right to left
     volume, mirrored = tmp_path / "volume.npz", str(tmp_path / "mirrored.npz")
@@ -858,6 +859,7 @@ def test_error_bars_are_refused_where_there_are_none(npz, tmp_path, capsys):
     for file, words, text in (
         (npz, ["--noise", "residuals"], "--noise: got residuals, which need a fit"),
         (npz, ["--noise", "0.1", "--method", "auto"], "--noise: got --method auto; expected spectral"),
+        (npz, ["--noise", "0.1", "--draws", "4"], "--draws: got 4; expected an integer of at least 8"),
         (npz, ["--noise", str(tmp_path / "absent.npz")], "absent.npz"),
         (
             volume,
@@ -865,5 +867,5 @@ def test_error_bars_are_refused_where_there_are_none(npz, tmp_path, capsys):
             "displaces this image by up to 1 from",
         ),
     ):
-        assert main(["hks", str(file), "-o", str(tmp_path / "out"), "--metric", "inverse", "-q", *words]) != 0
+        assert main(["hks", str(file), "-o", str(tmp_path / "out"), "--metric", "inverse", "-q", *words]) == 2
         assert text in capsys.readouterr().err

@@ -41,7 +41,7 @@ import numpy as np
 
 from hks_jax.cli.info import describe
 from hks_jax.cli.job import ComputationError, Settings
-from hks_jax.cli.noise import require_spectral, second_scan
+from hks_jax.cli.noise import check_noise, second_scan
 from hks_jax.cli.options import FILES, READING, SOLVING, defaults, flag, options_in, refuse
 from hks_jax.cli.outputs import Done, show
 from hks_jax.cli.progress import Progress, StudyProgress
@@ -90,7 +90,7 @@ def run(args: argparse.Namespace, begun: Progress) -> None:
     for subject in chosen:
         if subject.arguments is not None:
             require_metric(subject.arguments)
-            require_spectral(subject.arguments)
+            check_noise(subject.arguments)
     with_regions = any(s.arguments is not None and s.arguments.atlas is not None for s in subjects)
     if not with_regions:
         refuse(args, ("names",), "this option names labels, which are missing; pass --atlas, or a column named atlas")
