@@ -411,6 +411,7 @@ def test_messages_name_the_options():
         ("Pass order (--order), one of these", "Pass --order, one of these"),
         ('Pass components="largest", or components="all"', "Pass --components largest, or --components all"),
         ("k: got 0; expected 1", "-k: got 0; expected 1"),
+        ("iterations: got -1; expected 0", "--erode: got -1; expected 0"),
         ("b_max: 10 leaves none", "--b-max: 10 leaves none"),
         ("outside, pass the mask or mask them", "outside, pass the mask or mask them"),
     ):
