@@ -297,6 +297,12 @@ def test_a_study_is_a_bids_derivative(study, monkeypatch):
     assert (row["region"], row["voxels"], row["coverage"]) == ("left half", "32", "1")
     assert float(row["volume"]) == 32 * 12  # mm³
 
+    # The regions of a signature that is computed again without labels are gone.
+    assert (out / "group_regions.tsv").is_file()
+    words = command(study, "out", "--times", "3e3", "--only", "sub-01", "--replace", "--normalisation", "flat", "-q")
+    assert main([word for word in words if word not in ("--atlas", str(atlas))]) == 0
+    assert not list(out.rglob("*regions*"))
+
 
 def test_one_bad_subject_does_not_stop_the_others(study, monkeypatch, capsys):
     monkeypatch.setattr(

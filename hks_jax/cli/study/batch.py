@@ -91,8 +91,7 @@ def run(args: argparse.Namespace, begun: Progress) -> None:
         if subject.arguments is not None:
             require_metric(subject.arguments)
             check_noise(subject.arguments)
-    with_regions = any(s.arguments is not None and s.arguments.atlas is not None for s in subjects)
-    if not with_regions:
+    if not any(s.arguments is not None and s.arguments.atlas is not None for s in subjects):
         refuse(args, ("names",), "this option names labels, which are missing; pass --atlas, or a column named atlas")
     progress = StudyProgress(len(chosen), args.quiet)
     progress.start = begun.start
@@ -105,7 +104,7 @@ def run(args: argparse.Namespace, begun: Progress) -> None:
             there = {s.name for s in subjects if problems.get(s.name) == "" and _is_there(study, s)}
             problems = {name: why for name, why in problems.items() if name not in there}
         problems |= _other_units(study, [subject for subject in subjects if subject.name not in problems])
-        files = study.write_group(subjects, problems, with_regions)
+        files = study.write_group(subjects, problems)
     failed = [subject.name for subject in chosen if problems.get(subject.name)]
     tables = "\n".join(str(file) for file in files if file.suffix == ".tsv")
     show(args, Done(files, {"failed": failed}, tables))
