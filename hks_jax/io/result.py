@@ -104,10 +104,10 @@ class Result:
             about |= {"source": record.get("source") or "", "digest": record.get("sha256") or ""}
             about |= {"notes": tuple(record.get("notes", ()))}
             place = volume_of(str(path), arrays, tensors, **about)
-        elif "cells" in arrays:
-            place = TetMesh(arrays["vertices"], arrays["cells"])
         else:
-            place = SurfaceMesh(arrays["vertices"], arrays["faces"])
+            kind, cells = (TetMesh, arrays["cells"]) if "cells" in arrays else (SurfaceMesh, arrays["faces"])
+            # Only a mesh with a mask may have vertices that belong to no cell, which are outside the domain.
+            place = kind(arrays["vertices"], cells, mask=np.ones(cells.shape[:1], bool))
         eigenvalues, report = arrays.get("eigenvalues", np.zeros(0)), {"settings": record.get("settings") or {}}
         more = {n: a for n, a in arrays.items() if n in ("deviation", "noise_maps", "scaled_times", "input_tensors")}
         return cls(place, values, times, eigenvalues, report, more, name, str(path))

@@ -293,6 +293,9 @@ def test_signature_of_a_surface_without_some_vertices(tmp_path):
     assert main(["hks", str(tmp_path / "s.vtk"), "-o", str(tmp_path / "out"), *more]) == 0
     with np.load(tmp_path / "out" / "hks.npz") as found:
         np.testing.assert_allclose(found["hks"], expected, rtol=1e-5)
+    np.testing.assert_allclose(hj.io.Result.read(tmp_path / "out").values, expected, rtol=1e-5)
+    np.save(tmp_path / "labels.npy", 7 + (np.asarray(sphere.vertices)[:, 0] > 0))
+    assert main(["explore", str(tmp_path / "out"), "--labels", str(tmp_path / "labels.npy"), "-q"]) == 0
 
 
 # ---------------------------------------------------------------------------------------------------- convert
