@@ -223,5 +223,6 @@ def test_a_mesh_has_none_of_these_options(tmp_path, capsys, option):
     ("largest", "unit"), [(1e9, "m2/s"), (1.0, "um2/ms"), (3.0, "um2/ms"), (1000.0, None), (30.0, None), (6e4, None)]
 )
 def test_b_values_in_another_unit(largest, unit):
-    question = b_value_question(largest)
+    question = b_value_question(largest, "mm2/s")
     assert (f'pass unit "{unit}"' in question) if unit else question == ""
+    assert f'pass unit "{unit or "mm2/s"}"' in b_value_question(largest, "cm2/s" if unit else "um2/s")

@@ -154,7 +154,7 @@ def explore(
     }
     page = _assemble(about, numbers | surface)
     with atomic_path(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+        temporary.write_text(page, encoding="utf-8", errors="replace")  # the title may be a file name
     return Path(path)
 
 
