@@ -31,7 +31,7 @@ from hks_jax.io.result import Result, plain, tuples
 from hks_jax.io.volume import TensorVolume, digest, require_position
 
 OPTIONS = f"""
-target TARGET  the signature, an .npz file
+target TARGET  the signature, an .npz file or the folder of a signature
 @output
 --init FILE  the initial tensors: {FORMATS} (default: identity)
 --metric tensor|inverse|adjugate
@@ -80,6 +80,11 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     use_dtype(args.dtype)
     with progress.stage("reading", str(args.target)):
         target = Result.read(args.target, "hks", over_times=True)
+        if target.normalisation != "raw":
+            raise ValueError(
+                f"TARGET: got {target.source} with the normalisation {target.normalisation}; expected raw. Compute "
+                "it by 'hks-jax hks' without --normalisation"
+            )
         # The mask is the domain of the computed signature, so all of its components belong to the domain.
         grid = target.grid
         init = _initial(args, target.volume, grid, progress)
@@ -112,7 +117,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     names = ("init", "metric", "interpolation", "h1", "tv", "dtype", "checkpoint", "noise", "boundary", *_OF_SEARCH)
     report = {
         "target": {
-            "source": str(args.target),
+            "source": target.source,
             "shape": grid.shape,
             "spacing": grid.spacing,
             "nodes_inside": int(grid.inside.sum()),
@@ -158,7 +163,7 @@ def _write(args: argparse.Namespace, fit: Any, target: Result, report: dict[str,
     from hks_jax.plot.signature import placed
 
     volume = replace(target.volume, tensors=np.asarray(fit.field.domain_tensors), order="matrix", frame="voxel")
-    volume = replace(volume, source=str(args.target), digest=digest(args.target), notes=(), unit="")
+    volume = replace(volume, source=target.source, digest=digest(target.source), notes=(), unit="")
     history = {"losses": "loss", "misfits": "misfit", "stages": "stage", "starts": "start"}
     columns = {name: np.array([getattr(step, of) for step in fit.history]) for name, of in history.items()}
     with writing(args.output, report, progress, lambda: [args.output / "fit.png"]) as (folder, done):

@@ -714,9 +714,9 @@ def test_a_fit_has_the_boundary_that_its_target_says(conformal, tmp_path):
 @pytest.mark.slow
 def test_fit_end_to_end_recovers_the_metric(conformal, tmp_path, capsys):
     tensors, values = conformal
-    target, out = write_target(tmp_path / "target.npz", values), tmp_path / "out"
+    target, out = write_target(tmp_path / "hks.npz", values), tmp_path / "out"
     arguments = ["--max-steps", "4", "-q", "--json", *FIT_ARGUMENTS]
-    assert main(["fit", str(target), "-o", str(out), *arguments]) == 0
+    assert main(["fit", str(tmp_path), "-o", str(out), *arguments]) == 0  # the folder of a signature
     assert sorted(file.name for file in out.iterdir()) == ["fit.npz", "fit.png", "report.json", "tensors.npz"]
     assert (out / "fit.png").read_bytes()[:4] == b"\x89PNG"
 
@@ -781,6 +781,11 @@ def test_an_interrupted_fit_writes_the_best_so_far(conformal, tmp_path, capsys, 
     [
         ([], {"times": None, "spacing": None}, ["the arrays hks, origin;", "Add times, spacing"]),
         ([], {"times": FIT_TIMES[:2]}, ["hks of shape (3, 14, 13)", "times of shape (2,)"]),
+        (
+            [],
+            {"provenance": '{"settings": {"normalisation": "flat"}}'},
+            ["TARGET: got", "flat; expected raw"],
+        ),
         ([], {"hks": np.nan}, ["target: got 1 of 546 observed values that are NaN", "(2, 3, 4)"]),
         (["--init", "init.npz"], {}, ["--init: got tensors of shape (14, 12)", "the target's shape (14, 13)"]),
         (["--init", "volume.npz"], {}, ["shape (5, 4, 3)", "hks-jax convert volume.npz slice.npz --slice"]),
