@@ -204,8 +204,7 @@ def read_components(paths: Sequence[str], order: str | None, frame: str | None) 
         if not np.allclose(affine_in_mm(files[name], image)[0], affine, rtol=1e-4, atol=1e-3):
             raise ValueError(f"{files[name]}: its affine differs from that of {files['xx']}; expected equal affines")
     values = np.stack([voxels(files[name], image) for name, image in zip(names, images, strict=True)], axis=-1)
-    joined = optional("nibabel").Nifti1Image(values.reshape(*first.shape[:3], 1, 6), first.affine)
-    joined.header["xyzt_units"] = first.header["xyzt_units"]
+    joined = optional("nibabel").Nifti1Image(values.reshape(*first.shape[:3], 1, 6), first.affine, first.header)
     joined.header.set_intent(SYMMETRIC_MATRIX, (3,))
     return read_tensors(files["xx"], None, frame, joined)
 

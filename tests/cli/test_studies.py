@@ -159,6 +159,8 @@ def test_six_images_say_by_their_sidecar_along_which_axes_they_are(tmp_path):
     # World axes: x is −j, y is i, z is −k here.
     axes = AFFINE[:3, :3] / [2, 2, 3]
     np.testing.assert_allclose(read_tensors(paths, frame="world").tensors, axes.T @ tensors() @ axes, atol=1e-15)
+    unplaced = write_six(tmp_path, tensors(), None, "dt{}.nii")
+    assert "the file has neither sform nor qform, so left and right are a guess" in read_tensors(unplaced).notes
 
 
 def test_what_are_not_six_images_is_refused(tmp_path):
