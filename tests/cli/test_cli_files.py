@@ -197,17 +197,17 @@ def test_info_of_invalid_tensors_and_meshes(tmp_path, capsys):
 def test_info_of_results_says_what_they_are_and_how_to_draw_them(tensors, tmp_path, capsys):
     volume = read_tensors(tensors)
     report = {"settings": {"metric": "inverse", "normalisation": "flat"}}
-    (tmp_path / "out").mkdir()
+    (tmp_path / "my out").mkdir()
     result = Result(volume, np.ones((8, *SHAPE)), np.arange(1.0, 9.0), report=report)
-    result.save(tmp_path / "out" / "hks", ".nii.gz")
+    result.save(tmp_path / "my out" / "hks", ".nii.gz")
     replace(result, values=np.ones((1, *SHAPE)), times=np.zeros(0), name="curvature").save(tmp_path / "K", "")
-    for name in ("out", "out/hks.npz", "out/hks.nii.gz"):
+    for name in ("my out", "my out/hks.npz", "my out/hks.nii.gz"):
         assert main(["info", str(tmp_path / name)]) == 0
         text = capsys.readouterr().out
         assert "result          heat kernel signature\n" in text
         assert "times           1, 2, 3, 4, 5, 6, 7, 8\n" in text
         assert "normalisation   flat\n" in text
-        assert f"hks-jax plot {tmp_path / 'out' / 'hks.npz'} -o picture.png\n" in text
+        assert f"hks-jax plot '{tmp_path / 'my out' / 'hks.npz'}' -o picture.png\n" in text
     assert main(["info", str(tmp_path / "K.npz"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["result"], found["times"], found["to draw it"]) == (
