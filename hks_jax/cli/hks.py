@@ -217,13 +217,15 @@ def _draw_mesh(result: Result, path: Path) -> None:
 
     mesh = result.place
     assert isinstance(mesh, SurfaceMesh | TetMesh)
+    cells = mesh.triangulation
+    visible = cells.boundary_vertices if isinstance(mesh, TetMesh) else cells.used
     columns = min(len(result.times), 4)
     rows = math.ceil(len(result.times) / columns)
     figure = new_figure(3.4 * columns, 3.0 * rows + 0.3)
     figure.suptitle(caption(result))
     for i, (time, values) in enumerate(zip(result.times, result.values, strict=True)):
         ax = figure.add_subplot(rows, columns, i + 1, projection="3d")
-        ((low, high, _),) = colours_of([values], least_range=LEAST_RANGE)
+        ((low, high, _),) = colours_of([values[visible]], least_range=LEAST_RANGE)
         figure.colorbar(surface(ax, mesh, values, vmin=low, vmax=high), ax=ax, shrink=0.6)
         ax.set_title(f"$t$ = {number_text(float(time))}", fontsize="medium")
     save_figure(figure, path)

@@ -8,6 +8,7 @@ from pathlib import Path
 import nibabel as nib
 import numpy as np
 import pytest
+from matplotlib.image import imread
 
 import hks_jax as hj
 from hks_jax.cli import main
@@ -293,6 +294,8 @@ def test_signature_of_a_surface_without_some_vertices(tmp_path):
     assert main(["hks", str(tmp_path / "s.vtk"), "-o", str(tmp_path / "out"), *more]) == 0
     with np.load(tmp_path / "out" / "hks.npz") as found:
         np.testing.assert_allclose(found["hks"], expected, rtol=1e-5)
+    picture = imread(tmp_path / "out" / "hks.png")[..., :3]
+    assert np.ptp(picture[:, : picture.shape[1] // 2], axis=-1).max() > 0.3  # the surface has colours
     np.testing.assert_allclose(hj.io.Result.read(tmp_path / "out").values, expected, rtol=1e-5)
     np.save(tmp_path / "labels.npy", 7 + (np.asarray(sphere.vertices)[:, 0] > 0))
     assert main(["explore", str(tmp_path / "out"), "--labels", str(tmp_path / "labels.npy"), "-q"]) == 0
