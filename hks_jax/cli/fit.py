@@ -36,7 +36,7 @@ target TARGET  the signature, an .npz file or the folder of a signature
 --init FILE  the initial tensors: {FORMATS} (default: identity)
 --metric tensor|inverse|adjugate
     the metric of the tensors D in --init: inverse is D⁻¹, tensor is D itself, adjugate is |D|D⁻¹. This option is
-    required except for NumPy's files, whose tensors are the metric by default
+    required except for NumPy's files without a unit of length, whose tensors are the metric by default
 --order ORDER  order of the components in --init, if the file does not declare it
 @interpolation
 --parametrisation log-euclidean|cholesky|conformal|eigenvalues|rotation = log-euclidean
@@ -61,6 +61,7 @@ target TARGET  the signature, an .npz file or the folder of a signature
 """
 
 
+_NO_METRIC = "--metric: choose inverse, tensor or adjugate, because --init has diffusion tensors and not a metric"
 _OF_SEARCH = ("optimiser", "smoothness", "max_steps", "continuation", "starts", "seed")
 """Options that are arguments of `Search` with the same name."""
 
@@ -70,9 +71,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     if args.init is None:
         refuse(args, ("metric", "order"), "this option describes the tensors in --init, which is missing; pass both")
     elif args.metric is None and format_of(args.init).image:
-        raise ValueError(
-            "--metric: choose inverse, tensor or adjugate, because --init has diffusion tensors and not a metric"
-        )
+        raise ValueError(_NO_METRIC)
     from hks_jax import fit_metric
     from hks_jax.inverse import H1, Data, Search, TotalVariation
     from hks_jax.inverse.metric_fit import RESULTS
@@ -138,6 +137,8 @@ def _initial(args: argparse.Namespace, target: TensorVolume, grid: Grid, progres
         unit = np.eye(grid.dimension, dtype=args.dtype)
         return TensorField(grid, np.broadcast_to(unit, (*grid.shape, *unit.shape)), args.interpolation)
     volume = read_tensors(args.init, args.order)
+    if args.metric is None and volume.length_unit:  # of NumPy's files, as in `require_metric`
+        raise ValueError(_NO_METRIC)
     if volume.shape != grid.shape:
         remedy = "Give one tensor for each node of the target"
         if volume.dimension > grid.dimension:
@@ -168,7 +169,7 @@ def _write(args: argparse.Namespace, fit: Any, target: Result, report: dict[str,
     columns = {name: np.array([getattr(step, of) for step in fit.history]) for name, of in history.items()}
     with writing(args.output, report, progress, lambda: [args.output / "fit.png"]) as (folder, done):
         origin, extra = {"command": sys.argv, "settings": report["settings"]}, {"times": target.times, **columns}
-        metric = replace(volume, length_unit="")  # reading asks about the unit of diffusivity if lengths are in mm
+        metric = replace(volume, length_unit="")  # otherwise, the tensors count as diffusion tensors when they are read
         save_tensors(folder / "tensors.npz", metric, provenance=origin)
         save(folder / "fit.npz", np.asarray(fit.hks), volume, name="hks", extra=extra, provenance=origin)
         if volume.dimension == 2:

@@ -793,6 +793,7 @@ def test_an_interrupted_fit_writes_the_best_so_far(conformal, tmp_path, capsys, 
         (["--metric", "inverse"], {}, ["--metric", "--init"]),
         (["--init", "init.nii.gz"], {}, ["--metric: choose"]),
         (["--init", "init.nrrd"], {}, ["--metric: choose"]),
+        (["--init", "scan.npz"], {}, ["--metric: choose"]),
         (["--init", "init.vti"], {}, ["--metric: choose"]),
         (["--h1", "-1"], {}, ["--h1: got '-1'; expected a positive number"]),
     ],
@@ -806,6 +807,7 @@ def test_fit_errors_are_one_line_and_leave_nothing(conformal, tmp_path, capsys, 
     np.savez("init.npz", tensors=metric())
     np.savez("volume.npz", tensors=np.broadcast_to(np.eye(3), (5, 4, 3, 3, 3)))
     moved = np.eye(4) + 3.0 * np.eye(4)[:, [3, 0, 1, 2]] * [0, 0, 0, 1]
+    np.savez("scan.npz", tensors=metric(), length_unit="mm")
     np.savez("moved.npz", tensors=np.tile(np.eye(2), (*FIT_GRID.shape, 1, 1)), affine=moved)
     before = sorted(tmp_path.iterdir())
     assert one_error(capsys, main(["fit", "target.npz", "-o", "out", *arguments]), *words) == 2

@@ -318,6 +318,8 @@ def test_convert_to_every_format_and_back(tensors, tmp_path, capsys):
         if name != "t.nii":
             np.testing.assert_array_equal(read.mask, disc())
     assert capsys.readouterr().err == ""
+    assert main(["spectrum", str(tmp_path / "t.npz"), "-o", str(tmp_path / "out"), "-q"]) == 2
+    assert "--metric: choose the metric of the diffusion tensors" in capsys.readouterr().err
 
 
 def test_convert_orders_masks_and_repairs(tmp_path, capsys):
