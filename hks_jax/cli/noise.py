@@ -121,6 +121,11 @@ def noise_of_volume(
     if (second := second_scan(args)) is not None:
         other = read_volume(second, progress)
         require_position(args.noise, other.affine, volume.affine, volume.volume_shape)
+        if other.shape == grid.shape and (lacking := int((grid.inside & ~other.inside).sum())):
+            raise ValueError(
+                f"--noise: got {args.noise} without tensors at {lacking} of the {int(grid.inside.sum())} voxels of the "
+                "domain; expected tensors of both scans. Pass --mask with the voxels that both scans cover"
+            )
         return hj.TensorNoise.from_scans(volume.tensors, other.tensors, grid)
     return hj.TensorNoise.relative(volume.tensors, float(args.noise), grid)
 

@@ -863,7 +863,10 @@ def test_error_bars_are_refused_where_there_are_none(npz, tmp_path, capsys, monk
     volume, mirrored = tmp_path / "volume.npz", str(tmp_path / "mirrored.npz")
     np.savez(volume, tensors=tensors, affine=np.eye(4))
     np.savez(mirrored, tensors=tensors + np.eye(3), affine=moved)
+    cropped = str(tmp_path / "cropped.npz")
+    np.savez(cropped, tensors=tensors * (np.arange(4) > 0)[:, None, None], affine=np.eye(4))
     for file, words, text in (
+        (volume, ["--slice", "x=2", "-k", "4", "--noise", cropped], "without tensors at 4 of the 16 voxels"),
         (npz, ["--noise", "residuals"], "--noise: got residuals, which need a fit"),
         (npz, ["--noise", "0.1", "--method", "auto"], "--noise: got --method auto; expected spectral"),
         (npz, ["--noise", "0.1", "--draws", "4"], "--draws: got 4; expected an integer of at least 8"),
