@@ -24,7 +24,7 @@ from hks_jax.io.result import Result, signature_file
 OPTIONS = """
 result RESULT  the folder OUT that 'hks-jax hks' wrote, or an .npz from there
 -o,--output PAGE  the page (default: explore.html in OUT)
---labels FILE  region numbers on the same voxels or at the vertices, with 0 for unlabelled (NIfTI, .npy)
+--labels FILE  region numbers on the same voxels or at the vertices, with 0 for unlabelled (NIfTI, MRtrix, NRRD or .npy)
 @names
 --title TEXT  the page's title (default: the name of the tensors' file)
 --unit TEXT  the unit of t (default: s for the metric D⁻¹ of tensors from --bval and --bvec, otherwise none)

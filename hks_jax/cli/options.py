@@ -104,7 +104,7 @@ file FILE...
     that noise may explain. Automatic times of a single subject begin at a sufficient signal-to-noise ratio
 --draws N = 8  number of noisy maps from which error bars are computed
 [atlas]
---atlas FILE  integer labels on the image's voxels, with 0 for unlabelled: NIfTI, or .npy of the image's shape
+--atlas FILE  integer labels on the image's voxels, with 0 for unlabelled (NIfTI, MRtrix, NRRD or .npy)
 [names]
 --names FILE
     names of the labels: a table with the columns index and name, or lines of a number and a name, such as FreeSurfer's

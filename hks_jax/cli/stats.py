@@ -31,7 +31,7 @@ from hks_jax.signatures.regions import region_statistics
 OPTIONS = """
 result RESULT  the folder OUT that 'hks-jax hks' wrote, or an .npz from there
 -o,--output TABLE  the table (default: regions.tsv in OUT)
---atlas FILE!  integer labels on the image's voxels, with 0 for unlabelled: NIfTI, or .npy of the image's shape
+--atlas FILE!  integer labels on the image's voxels, with 0 for unlabelled (NIfTI, MRtrix, NRRD or .npy)
 @names
 """
 

@@ -11,7 +11,6 @@ from scipy import ndimage
 
 from hks_jax.domain.components import as_mask
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
-from hks_jax.io import nifti
 from hks_jax.io.formats import IMAGES, format_of
 from hks_jax.io.tables import read_table
 from hks_jax.io.volume import TensorVolume, corners
@@ -81,14 +80,15 @@ def erode(mask: Bool[np.ndarray, "*shape"], iterations: int = 1) -> Bool[np.ndar
 
 
 def read_labels(path: str | os.PathLike[str], on: TensorVolume | SimplicialMesh) -> Integer[np.ndarray, "*shape"]:
-    """Read integer labels at the voxels of an image or the vertices of a mesh from NIfTI or ``.npy`` (0: unlabelled).
+    """Read integer labels at the voxels of an image or the vertices of a mesh; 0 means unlabelled.
 
-    If the labels and the image have affines, their voxels must coincide. For a slice, the file may have the labels of
-    the whole volume, or of the slice in two dimensions. Otherwise, the labels must have the shape of the image.
+    The formats are NIfTI, MRtrix, NRRD and ``.npy``. If the labels and the image have affines, their voxels must
+    coincide. For a slice, the file may have the labels of the whole volume, or of the slice in two dimensions.
+    Otherwise, the labels must have the shape of the image.
     """
     shape, affine = (on.shape, on.affine) if isinstance(on, TensorVolume) else ((len(on.vertices),), None)
     name = os.fspath(path)
-    values, place = _image(name, affine, (*nifti.SUFFIXES, ".npy"))
+    values, place = _image(name, affine, tuple(suffix for suffix in IMAGES if suffix != ".npz"))
     if isinstance(on, TensorVolume) and affine is not None and place is not None and values.ndim in (2, 3):
         if values.ndim == 2:  # the file's two axes are the axes of the slice
             values = np.expand_dims(values, on.thin_axis)

@@ -128,7 +128,10 @@ def _dissect(pattern: Pattern, merge: bool) -> Dissection:
     _, height, stride = shapes = np.array([level.shape for level in levels]).T
     start = np.append(0, np.cumsum(np.prod(shapes, axis=0)))
     if start[-1] > np.iinfo(np.int32).max:
-        raise ValueError(f"matrix: got {n} rows, whose factors have {start[-1]} entries; expected fewer than 2^31")
+        raise ValueError(
+            f"matrix: got {n} rows, whose factors have {start[-1]} entries; expected fewer than 2^31. Use a coarser "
+            "grid or mesh, or the Chebyshev filter, which does not factorise"
+        )
     mine = np.flatnonzero(order_of_ends <= 0)
     rows, cols, eliminated = rows[mine], cols[mine], level[cols[mine]]
     place = slot[rows]
