@@ -1,7 +1,7 @@
 """Write a page to explore a signature in a browser.
 
 Write a page to explore the signature that 'hks-jax hks' has written to the folder OUT. The page is one HTML file that
-any browser opens without a network. It has sliders for t and the slice, maps of the signature and of the tensors,
+any browser opens without a network. The page has sliders for t and the slice, maps of the signature and of the tensors,
 curves over t at chosen points, the distances between a chosen point's curve and all other curves, and mean curves of
 regions. Curves can be saved as CSV, and surfaces can be rotated.
 

@@ -50,7 +50,7 @@ file FILE...
     700 um2/s (TORTOISE) or 7e-10 m2/s. With --bval, the b-values have the reciprocal unit
 --array NAME  name of the tensors' array in an npz or VTK file with several arrays
 --spacing H...  distance between nodes, for .npy and .npz files that do not contain it
---confidence C = 0.5  confidence above which voxels of NRRD's masked tensors are inside
+--confidence C = 0.5  confidence above which a voxel of NRRD's masked tensors belongs to the mask
 [invalid] tensors that are not positive definite: by default, they raise an error
 --repair HOW[:FLOOR]
     repair of a few tensors: clip raises their eigenvalues to FLOOR (default: 1 % of the median of mean eigenvalues),

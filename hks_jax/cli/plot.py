@@ -59,8 +59,8 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     result = Result.read(args.result, args.array)
     if args.scaled and not (result.times.size and result.normalisation in ("raw", "flat")):
         raise ValueError(
-            f"--scaled: got {args.result} with the normalisation {result.normalisation}; expected raw or flat, and "
-            "times. Leave this option out"
+            f"--scaled: got {args.result} with the normalisation {result.normalisation}; expected a result with "
+            "times and the normalisation raw or flat. Leave this option out"
         )
     chosen = _choose_times(result, args)
     result = replace(result, values=result.values[chosen], times=result.times[chosen[: result.times.size]])
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     values = result.values * result.flat_scale if args.scaled and not flat else result.values
     if args.points is None:
         figure = _panels(replace(result, values=values), args)
-    else:  # hks_curves multiplies by the scale itself
+    else:  # hks_curves multiplies its values by (4πt)^(d/2)
         raw = result.values / result.flat_scale if flat else result.values
         figure = _curves(replace(result, values=raw), args, args.scaled or flat)
     save_figure(figure, args.output, dpi=args.dpi)
