@@ -180,7 +180,7 @@ def _lines(description: dict[str, Any]) -> list[str]:
     in_mm, unit = description.get("length_unit") == "mm", description.get("unit", "")
     if in_mm and not unit:
         known = is_plausible(description.get("median_mean_diffusivity", 0.0))
-        unit = f"{MM2_PER_S} (not declared)" if known else "(unit not declared)"
+        unit = f"{MM2_PER_S} (assumed)" if known else "(unit not declared)"
     time = " s" if in_mm and unit.startswith(MM2_PER_S) else ""
     if "eigenvalues" in description:
         e = description["eigenvalues"]

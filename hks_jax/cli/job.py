@@ -79,13 +79,25 @@ def result_of(
     """Compute the signature on a mesh, or on a volume whose mask is the domain; the report includes `described`."""
     with progress.stage("signature"):
         times = settings.times.explicit or automatic_times(pairs, settings.times.automatic)
+        _warn_of_late(times, pairs, progress)
         values, origin = _signature(pairs, times, settings)
     report = {"input": described, **_report(settings, pairs, times), **origin}
     return Result(place, values, np.asarray(times), np.asarray(pairs.eigenvalues), report)
 
 
+def _warn_of_late(times: tuple[float, ...], pairs: hj.Eigenpairs, progress: Progress) -> None:
+    """Warn of times at which √t exceeds half the length of an interval with the same first positive eigenvalue λ₁."""
+    eigenvalues = np.asarray(pairs.eigenvalues)
+    largest = LAST / float(eigenvalues[eigenvalues > 0].min(initial=np.inf))
+    if late := [t for t in times if t > 4 * largest > 0]:
+        progress.warn(
+            f"{len(late)} of {len(times)} times are too large for the domain: at t > {4 * largest:.3g}, √t exceeds "
+            f"half the length of the domain, and the signature mainly shows its size. Choose times up to {largest:.3g}"
+        )
+
+
 def automatic_times(pairs: hj.Eigenpairs, n: int) -> tuple[float, ...]:
-    """Return n default times; at the last time, √t is about half the length of the domain."""
+    """Return n default times; at the last time, √t is about a quarter of the length of the domain."""
     return tuple(np.asarray(hj.default_times(pairs, n, math.exp(-LAST)), np.float64).tolist())
 
 

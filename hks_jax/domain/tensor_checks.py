@@ -38,7 +38,8 @@ def checked_interpolation(interpolation: Any) -> Interpolation:
 def require_grid(grid: Any) -> None:
     """Raise TypeError for anything that is not a grid."""
     if not isinstance(grid, Grid):
-        raise TypeError(f"grid: got {type(grid).__name__}; expected hks_jax.Grid")
+        remedy = ". Pass volume.grid() of a volume" * hasattr(grid, "grid")
+        raise TypeError(f"grid: got {type(grid).__name__}; expected hks_jax.Grid{remedy}")
 
 
 def tensors_on(grid: Any, name: str, tensors: Any) -> Float[Array, "*shape d d"]:

@@ -120,8 +120,8 @@ class TensorField(eqx.Module):
             >>> print(jnp.linalg.det(metric.tensors[4, 4]).round(3))  # 1/|D|
             0.25
         """
-        check_metric_choice(metric)
         tensors = spd.symmetrise(_checked_tensors(name, grid, D))
+        check_metric_choice(metric)
         if metric == "tensor":
             return cls._checked(grid, interpolation, tensors)
         return cls(grid, _metric_of_diffusion(spd.identity_outside(tensors, grid.inside), metric), interpolation)

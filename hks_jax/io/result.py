@@ -18,6 +18,7 @@ from hks_jax.io.arrays import volume_of
 from hks_jax.io.files import save
 from hks_jax.io.units import median_mean_diffusivity
 from hks_jax.io.volume import TensorVolume
+from hks_jax.signatures.times import RESOLVED
 from hks_jax.storage import load_npz
 
 NAMES = ("hks", "curvature")
@@ -187,6 +188,12 @@ class Result:
         return (self.values - flat.get(self.normalisation, median)) / self.arrays["deviation"]
 
     @property
+    def smallest_time(self) -> float:
+        """The time below which more than 1 % of the signature lies beyond its eigenpairs; 0 if this is not known."""
+        spectral = self.eigenvalues.size and self.settings.get("method", "spectral") == "spectral"
+        return RESOLVED[self.dimension] / float(self.eigenvalues[-1]) if spectral else 0.0
+
+    @property
     def flat_scale(self) -> Float[np.ndarray, "n_times ..."]:
         """(n_times, 1, …), the factor (4πt)^(d/2) of the normalisation ``"flat"`` in d dimensions."""
         return (4 * np.pi * self.times.reshape(-1, *[1] * (self.values.ndim - 1))) ** (self.dimension / 2)
@@ -206,8 +213,11 @@ class Result:
 
 
 def signature_file(result: Path) -> Path:
-    """Return the path of the signature in a folder that ``hks-jax hks`` wrote; return any other path unchanged."""
-    return result / "hks.npz" if result.is_dir() else result
+    """Return the path of the signature in a folder of ``hks-jax hks`` or of a study's subject, or else the path."""
+    if not result.is_dir():
+        return result
+    of_subject = [file for folder in ("", "*/") for file in result.glob(f"{folder}dwi/*_param-hks_dwimap.npz")]
+    return of_subject[0] if len(of_subject) == 1 else result / "hks.npz"
 
 
 def tuples(value: Any) -> Any:

@@ -106,8 +106,9 @@ class TensorVolume:
             per_axis(f"{where}{name}", value, d)
         if min(self.spacing) <= 0:
             raise ValueError(f"{where}spacing: got {self.spacing}; expected positive numbers")
-        if mask is not None and (mask.shape != shape or mask.dtype != bool):
-            raise ValueError(f"{where}mask: got shape {mask.shape}, {mask.dtype}; expected booleans of shape {shape}")
+        if mask is not None and not (isinstance(mask, np.ndarray) and mask.shape == shape and mask.dtype == bool):
+            got, remedy = describe_array(mask), ". `read_mask` reads a file" * isinstance(mask, str | os.PathLike)
+            raise ValueError(f"{where}mask: got {got}; expected a bool array of shape {shape}{remedy}")
         if self.affine is not None and (self.affine.shape != (4, 4) or not np.isfinite(self.affine).all()):
             raise ValueError(f"{where}affine: got shape {self.affine.shape}; expected finite numbers of shape (4, 4)")
         if self.slice_axis not in ((None,) if d == 3 else (None, 0, 1, 2)):

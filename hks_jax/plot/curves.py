@@ -11,13 +11,14 @@ from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.weyl import weyl_count
-from hks_jax.plot.figure import SMALL
+from hks_jax.plot.figure import SMALL, number_text
 from hks_jax.plot.panels import checked_times
 
 
@@ -70,6 +71,9 @@ def hks_curves(
     factor = (4 * math.pi * t) ** (grid.dimension / 2) if scaled else np.ones_like(t)
     colours = colormaps[cmap](np.linspace(0.0, 0.85, len(nodes)))
     ax.set(xscale="log", yscale="linear" if scaled else "log")
+    if t.max() < 100 * t.min():  # by default, Matplotlib labels so many ticks that the labels overlap
+        ax.xaxis.set(major_locator=LogLocator(subs=(1, 2, 5)), minor_formatter=NullFormatter())
+        ax.xaxis.set_major_formatter(lambda value, _: number_text(value))
     lines = []
     for node, label, colour in zip(nodes, labels, colours, strict=True):
         lines += ax.plot(t, factor * curves[node], **{"color": colour, "label": label, **kwargs})

@@ -92,8 +92,9 @@ def caption(result: Result) -> str:
 
 
 def titles_of(result: Result) -> Sequence[str]:
-    """Return a title for each time of a signature."""
-    titles = panel_titles(result.times, None, result.unit)
+    """Return a title for each time of a signature, with the length √(Dt) if it is known."""
+    early = [" (too few eigenpairs)" * bool(t < result.smallest_time) for t in result.times]
+    titles = [title + why for title, why in zip(panel_titles(result.times, None, result.unit), early, strict=True)]
     if result.lengths is None:
         return titles
     lengths = (f"{length:.3g} {result.length_unit}".rstrip() for length in result.lengths)

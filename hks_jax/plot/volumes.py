@@ -23,6 +23,8 @@ PLANES = ((0, 1), (0, 2), (1, 2))
 """The horizontal and vertical axes of the three slices."""
 _COLUMN, _COLUMNS = 2.3, 6
 """The width of a column of slices in inches, and the maximum number of columns."""
+_LEAST_HEIGHT = 0.8
+"""The least height of a slice in inches, which leaves room for the labels of its vertical axis."""
 
 
 def middle_node(inside: Bool[np.ndarray, "*shape"]) -> tuple[int, ...]:
@@ -153,7 +155,7 @@ def volume_panels(
     rows = math.ceil(t.size / _COLUMNS)
     columns = math.ceil(t.size / rows)
     sizes = np.multiply(shown.shape, shown.spacing)
-    heights = [float(np.clip(_COLUMN * sizes[up] / max(sizes[:2]), 0.25, 3 * _COLUMN)) for _, up in PLANES]
+    heights = [float(np.clip(_COLUMN * sizes[up] / max(sizes[:2]), _LEAST_HEIGHT, 3 * _COLUMN)) for _, up in PLANES]
     coordinates = [f"{name} ({length_unit})" if length_unit else name for name in AXES]
     fig = new_figure(
         columns * (_COLUMN + 0.2) + 0.6, rows * (sum(heights) + 1.35 + 0.15 * bool(label)) + 0.3 * bool(suptitle)

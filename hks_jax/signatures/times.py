@@ -87,8 +87,8 @@ def default_times(pairs: Eigenpairs, n: int = 16, decay: float = 1e-4) -> Float[
     """Return n times, log-spaced from 4 ln10/λ_last to 4 ln10/λ₁ (Sun, Ovsjanikov and Guibas 2009, section 5).
 
     At the first time the last mode has decayed by the factor 1e-4. At the last time, which is not before the first, all
-    modes except the constant have decayed at least by the factor `decay`. The command line uses the decay 0.085; at the
-    last time √t is then half the length of an interval with the same λ₁.
+    modes except the constant have decayed at least by the factor `decay`. The command line uses the decay 0.54; at the
+    last time √t is then a quarter of the length of an interval with the same λ₁.
 
     Examples:
         >>> times = hj.default_times(pairs, 3)
@@ -127,8 +127,9 @@ DEFAULT_K = {2: 200, 3: 100}
 """The default number of eigenpairs by dimension. It is smaller in 3D, where factorisations cost more."""
 RESOLVED = {2: 4.6, 3: 5.7}
 """The least λ_k·t, by dimension, at which at most 1 % of the signature lies beyond k pairs (`hks_jax.truncation`)."""
-LAST = (math.pi / 2) ** 2
-"""The value of λ₁·t at the largest time, at which √t is half the length of an interval with the first eigenvalue λ₁."""
+LAST = (math.pi / 4) ** 2
+"""The largest value of λ₁·t, at which √t is a quarter of the length of an interval with the first eigenvalue λ₁. At
+larger times, the signature mainly shows the size of the domain."""
 COARSE = 6.0
 """The least t/h² at which the grid spacing h biases the signature by at most 1 %."""
 
