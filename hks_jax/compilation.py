@@ -19,7 +19,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 _OPTIONS: dict[str, bool | int | str] = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 2}
-"""Compiler options that halve the time of compilation. In measurements, compiled code was not slower."""
+"""Compiler options that halve the time of compilation. In measurements, the options did not slow compiled code."""
 
 NumPyRule = Callable[[list[Any], list[Any] | None, list[Any] | None], Any]
 """A rule (primals, x, y) that computes a function or its derivative by NumPy, or returns None if it cannot.

@@ -36,9 +36,9 @@ Ints = Int[np.ndarray, " _"]
 class Parts(NamedTuple):
     """A recursive bisection of a graph: part q of a level is divided into parts 2q and 2q + 1 of the next level."""
 
-    # the level of the separator that contains each vertex; for vertices in cells, the last level
+    # for each vertex, the level of the separator that contains it; for vertices of cells, the last level
     level: Int[np.ndarray, " n"]
-    part: Int[np.ndarray, " n"]  # the number q of the part whose separator, or cell, contains each vertex
+    part: Int[np.ndarray, " n"]  # for each vertex, the number q of the part whose separator or cell contains it
     depth: int  # the number of levels
 
 
@@ -86,7 +86,7 @@ def _banded(n: int, rows: Ints, cols: Ints) -> tuple[Ints, csr_matrix]:
 
 
 # In a disconnected graph, an additional coordinate places the connected components one after another, with gaps as long
-# as the components. With longer gaps, a single isolated vertex would determine the principal axis.
+# as the components. With longer gaps between components, a single isolated vertex would determine the principal axis.
 def _coordinates(graph: csr_matrix) -> Float[np.ndarray, "n c"]:
     """Return coordinates of each vertex: averaged graph distances from the landmarks of its component."""
     n = graph.shape[0]
@@ -154,7 +154,7 @@ def within_groups(counts: Int[np.ndarray, " groups"]) -> Int[np.ndarray, " n"]:
 
 # Kőnig's theorem: for a maximum matching, consider alternating paths (an unmatched edge, a matched edge, …) from the
 # unmatched left vertices. The left vertices that no alternating path reaches and the right vertices that one reaches
-# form a vertex cover. Since this cover has as many vertices as the matching has edges, no cover is smaller.
+# form a vertex cover. Since this vertex cover has as many vertices as the matching has edges, no cover is smaller.
 def minimum_cover(left: Int[np.ndarray, " m"], right: Int[np.ndarray, " m"]) -> Int[np.ndarray, " s"]:
     """Return a minimum vertex cover of a bipartite graph, given the left and right ends of its edges."""
     lefts, row = np.unique(left, return_inverse=True)

@@ -106,7 +106,7 @@ def chebyshev_heat_coefficients(
 def coefficient_tails(z: float) -> Float[np.ndarray, " n_and_1"]:
     """Return, for each n, the sum of the absolute values of the n-th and all later Chebyshev coefficients of exp(−tλ).
 
-    The argument z is t·top/2 for the interval 0 ≤ λ ≤ top. Coefficients below 1e-25 are omitted. The last sum is 0.
+    For the interval 0 ≤ λ ≤ top, the argument z is t·top/2. Coefficients below 1e-25 are omitted. The last sum is 0.
     """
     n = np.arange(int(math.sqrt(2 * z * 60) + 60) + 1)
     sizes = np.where(n == 0, 1, 2) * scipy.special.ive(n, z)

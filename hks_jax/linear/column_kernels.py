@@ -3,7 +3,7 @@
 Orthogonalisation computes inner products of columns, and combines the columns with coefficients from these products.
 XLA launches four kernels for this task: for partial sums of the inner products, for their sum, for the coefficients,
 and for the combined columns. This module launches only two kernels. The first kernel computes the partial sums. In the
-second kernel, each thread block adds all partial sums, computes the coefficients, and combines its own rows.
+second kernel, each thread block adds all partial sums, computes the coefficients, and combines its rows of the columns.
 """
 
 from collections.abc import Callable

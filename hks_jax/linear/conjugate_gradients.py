@@ -63,8 +63,8 @@ def conjugate_gradients(
         clean: the projection onto the subspace in which all Aᵢ are positive definite. If rounding makes an inner
             product rᵢᵀzᵢ or pᵢᵀAᵢpᵢ nonpositive, the iteration restarts from the projected solutions.
         orthogonal: whether to reorthogonalise residuals, which reduces the number of steps for ill-conditioned
-            matrices. Reorthogonalisation requires JAX arrays with b = 1, and ``product(x, first)`` must return the
-            right-hand side, instead of ``rhs``, if ``first`` is true, so that common operations are compiled once.
+            matrices. Reorthogonalisation requires JAX arrays with b = 1. If ``orthogonal`` and ``first`` are true,
+            ``product(x, first)`` must return the right-hand side, which may share compiled operations with products.
     """
     xp, n = rhs.__array_namespace__(), len(rhs)
 

@@ -90,7 +90,7 @@ def _dissect(pattern: Pattern, merge: bool) -> Dissection:
     n = pattern.size
     level, front, depth = pattern.bisect()
     own, slot = _own_nodes(level, front, depth)
-    # This difference is positive if an entry's row is eliminated before its column, and negative if after its column.
+    # The difference of levels is positive if an entry's row is eliminated before its column, and negative if after it.
     order_of_ends = level[rows] - level[cols]
     above = np.flatnonzero(order_of_ends > 0)
     boundaries = _boundaries(level, front, depth, rows[above], cols[above])

@@ -55,8 +55,8 @@ class FactorisedMatrix(eqx.Module):
         factor: LDLᵀ. Derivatives treat the factorisation as a constant.
         sound: whether the factorisation passes a test with random right-hand sides. If the test is passed, LDLᵀ has the
             inertia of A, and iterative refinement of solutions converges. If the test fails, results are NaN.
-        error: an estimate of ‖I − AF⁻¹‖ in the Frobenius norm, where F is the computed LDLᵀ. The estimate also applies
-            to the error of log|det A| and to the relative error of A⁻¹. If small pivots were replaced, the estimate is
+        error: an estimate of ‖I − AF⁻¹‖ in the Frobenius norm, where F is the computed LDLᵀ. This estimate also holds
+            for the error of log|det A| and the relative error of A⁻¹. If small pivots were replaced, the estimate is
             infinite, and log|det A| and A⁻¹ are NaN. Solutions are more accurate than A⁻¹, because they are refined.
     """
 
@@ -257,8 +257,8 @@ def _eliminated(matrix: Float[Array, " m"], factor: Factorisation) -> Eliminated
 
 
 # Only selected entries of d(A⁻¹) = −A⁻¹ dA A⁻¹ are needed. The derivative rule differentiates both steps of selected
-# inversion: the elimination, and the recursion from the first separator to the cells. The transpose of the rule takes a
-# few times as many operations. The values of A⁻¹ come from the factors of A.
+# inversion: the elimination, and the recursion from the first separator to the cells. The transposed rule takes a few
+# times as many operations as the inversion. The values of A⁻¹ come from the factors of A.
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _inverse(diagonal: bool, matrix: Float[Array, " m"], factor: Factorisation) -> Float[Array, " n"]:
     return selected(factor.dissection, _eliminated(matrix, factor), diagonal)

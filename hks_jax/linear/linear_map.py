@@ -24,8 +24,8 @@ Tree = TypeVar("Tree")
 #     ⎡ 0   I ⎤ ⎡u⎤   ⎡b⎤                  ⎡ 0   F ⎤
 #     ⎣ I  −S ⎦ ⎣v⎦ = ⎣c⎦,    where    S = ⎣ Fᵀ  0 ⎦.
 #
-# The solution is v = b, u = c + S b. With the right-hand sides b = (0, x) and c = 0, the unknown u contains F x.
-# Differentiating the solve differentiates products with S, which have a custom rule. The system is its own transpose.
+# The solution is v = b, u = c + S b; if b = (0, x) and c = 0, the unknown u contains F x. Derivatives of the solution
+# need those of products with S, which have a custom rule. Since S is symmetric, reverse mode solves the same system.
 def linear_map(function: LinearMap, derivative: Derivative, at: Any, constants: Any, x: Any) -> Any:
     """Return ``function(at, constants, x)``; its derivative with respect to ``at`` is computed by ``derivative``.
 

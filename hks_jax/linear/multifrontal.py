@@ -77,9 +77,9 @@ class Trial(NamedTuple):
 
 # If the shift is an eigenvalue of a subdomain, a pivot vanishes. A small pivot δ causes Schur complements of size 1/δ
 # and, because the next front is inverted explicitly, rounding errors of ε/δ². Replacing δ by the least allowed pivot
-# changes the matrix by at most twice this pivot. Rounding errors and this change are equal and bounded if the least
+# changes the matrix by at most twice this pivot. Rounding errors and the change are equal and bounded if the least
 # allowed pivot is near ε^(1/3) (static pivoting, Li and Demmel 1998). In measurements, ε^(3/8) as the least allowed
-# pivot gives the best counts of eigenvalues. A first attempt replaces no pivots, because small pivots may be harmless.
+# pivot gives the best eigenvalue counts. A first factorisation replaces no pivots, as small pivots may be harmless.
 def factorise(dissection: Dissection, matrix: Float[Array, " m"], least: Scalar | None = None) -> Factorisation:
     """Factorise a symmetric matrix, without pivoting between fronts; `try_out` measures the accuracy.
 

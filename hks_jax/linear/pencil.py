@@ -15,8 +15,8 @@ class NullSpace(eqx.Module):
 
     Attributes:
         vectors: a basis (m, n_dof); m may be 0.
-        fixed: whether every perturbation of K annihilates the null space too, as for stiffness matrices of finite
-            elements. If true, derivatives omit products of perturbations and null vectors, which are only rounding.
+        fixed: whether every perturbation of K annihilates the null space too, as for finite-element stiffness matrices.
+            If ``fixed`` is true, derivatives omit these products of perturbations and null vectors.
     """
 
     vectors: Float[Array, "m n_dof"]

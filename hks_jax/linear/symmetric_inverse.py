@@ -23,7 +23,7 @@ _ROWS = 32
 _MANY = 128
 """Batches of at least this size usually are definite, because the spectra of small subdomains are above the shift."""
 _LARGEST, _SMALLEST = 64, 16
-"""The largest number of rows for a kernel (4 warps with 32 numbers per thread), and the least number after padding."""
+"""The largest number of rows for a kernel (4 warps with 32 numbers per thread), and the smallest padded size."""
 
 
 def symmetric_inverses(matrices: Matrices, least: Pivots | None = None) -> Inverses:
@@ -124,8 +124,8 @@ def _by_blocks(invert: Callable[[Array, Array], Inverses], size: int, matrices: 
         return _swept(a, rows, inverses, at), jax.lax.dynamic_update_slice_in_dim(pivots, of_block, at, axis=1)
 
     a, pivots = jax.lax.fori_loop(0, whole // size, sweep, (a, jnp.zeros((m, whole), a.dtype)))
-    # Each padding row has a pivot 1, but pivots above 1 may be listed after these ones. Of the pivots from n − 1 on, at
-    # most one is not positive, so that their product keeps the determinant and the inertia.
+    # Each padding row has a pivot 1, but larger pivots may be listed after these pivots. From index n − 1 on, at most
+    # one pivot is not positive, so that the product of these pivots keeps the determinant and the inertia.
     last = jnp.prod(pivots[:, n - 1 :], axis=1, keepdims=True)
     return -a[:, :n, :n], jnp.concatenate([pivots[:, : n - 1], last], axis=1)
 
@@ -133,7 +133,7 @@ def _by_blocks(invert: Callable[[Array, Array], Inverses], size: int, matrices: 
 # Sweeping a diagonal block P of a symmetric matrix A replaces P by −P⁻¹, and replaces the block of the other rows and
 # columns by the Schur complement of P. If all diagonal blocks are swept, the result is −A⁻¹. By Sylvester's law of
 # inertia, A has as many negative eigenvalues as negative pivots. Let U be the rows of A through P with P replaced by
-# −I, and A₀ be A with zeros in the rows and columns of P. The swept matrix A₀ − UᵀP⁻¹U takes two products and one pass.
+# −I, and A₀ be A with zeros in the rows and columns of P. The swept matrix A₀ − UᵀP⁻¹U takes two matrix products.
 def _swept(a: Matrices, rows: Float[Array, "m s n"], inverses: Float[Array, "m s s"], at: Int[Array, ""]) -> Matrices:
     """Sweep the block that begins at row ``at``, given its inverse."""
     index, own = jnp.arange(a.shape[1], dtype=at.dtype), at + jnp.arange(rows.shape[1], dtype=at.dtype)
