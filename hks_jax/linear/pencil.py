@@ -16,7 +16,7 @@ class NullSpace(eqx.Module):
     Attributes:
         vectors: a basis (m, n_dof); m may be 0.
         fixed: whether every perturbation of K annihilates the null space too, as for finite-element stiffness matrices.
-            If ``fixed`` is true, derivatives omit these products of perturbations and null vectors.
+            If ``fixed`` is true, derivatives omit the products of perturbations and null vectors.
     """
 
     vectors: Float[Array, "m n_dof"]
