@@ -1,11 +1,12 @@
 """The interface of linear solvers for derivatives of eigenpairs, and their common functions, in NumPy or JAX.
 
-Derivatives of a truncated spectrum need linear solves with K − λᵢM on the M-orthogonal complement of the p lowest
-eigenvectors. On this complement, K − σM is positive definite for *every* σ below the next eigenvalue Λ, even if it is
-indefinite on the whole space. If K − λᵢM is preconditioned with K − σM, its spectrum lies between 1 and (Λ − λᵢ)/(Λ −
-σ). So right-hand sides (rows) are grouped by λᵢ, and each group has its own shift σ. A few factorisations then suffice
-for fast convergence of all rows. `HostAdjoint` uses SciPy's factorisations, `FactorisedAdjoint` uses factorisations in
-JAX, and `FilteredAdjoint` uses a polynomial.
+The derivatives of k eigenpairs need linear solves with K − λᵢM on the M-orthogonal complement of the p ≥ k lowest
+eigenvectors. If the shift σ is below the lowest eigenvalue Λ on the complement of the p computed eigenvectors, K − σM
+is positive definite on this complement, even if it is indefinite on the whole space. Preconditioning with K − σM maps
+the spectrum of K − λᵢM on the complement to the interval between 1 and (Λ − λᵢ)/(Λ − σ). Right-hand sides are the rows
+of an array. The right-hand sides of similar eigenvalues λᵢ form a group with its own shift σ, so that a few
+factorisations of K − σM suffice for fast convergence. `HostAdjoint` uses SciPy's factorisations, `FactorisedAdjoint`
+uses factorisations in JAX, and `FilteredAdjoint` uses a polynomial.
 """
 
 from abc import abstractmethod
@@ -29,7 +30,7 @@ Scalar = Float[Array, ""]
 Values = Float[Array, " p"]
 """The p lowest eigenvalues, in ascending order."""
 Vectors = Float[Array, "p n_dof"]
-"""The M-orthonormal eigenvectors Φ of these eigenvalues."""
+"""The M-orthonormal eigenvectors Φ of the p lowest eigenvalues, as rows."""
 Rows = Float[Array, "k n_dof"]
 """Right-hand sides or solutions as rows; row i belongs to λᵢ."""
 OfRows = Float[Array, " k"]
@@ -41,7 +42,8 @@ SINGULAR = 1e-8
 _LEAST = 100
 """In units of ε: the least relative tolerance, and the relative norm below which a projected row counts as zero."""
 _FACTORISATION = 200
-"""The cost of a factorisation in solves of one row. About 100 is doubled, because small rows take few steps."""
+"""The cost of a factorisation of K − σM, in units of one conjugate gradient step for one right-hand side. The true cost
+of about 100 steps is doubled, because small right-hand sides take few steps."""
 _MOST_GROUPS = 16
 _ROWS = 128
 """The number of rows projected together; with fewer rows, the eigenvectors are read from memory more often."""
@@ -82,7 +84,8 @@ def attainable(tolerance: float, dtype: Any) -> float:
 def definite_product(
     stiffness: Callable[[Array], Array], mass: Callable[[Array], Array], shifts: Float[Array, " b"], beyond: Scalar
 ) -> Callable[[Columns], tuple[Columns, Float[Array, " b"]]]:
-    """Return a function that maps xᵢ to (K − λᵢM) xᵢ and to the energy below which K − λᵢM counts as singular."""
+    """Return the function of columns xᵢ that returns (K − λᵢM) xᵢ and, for each column, the energy xᵢᵀ(K − λᵢM)xᵢ below
+    which the matrix K − λᵢM counts as singular."""
 
     def product(x: Columns) -> tuple[Columns, Float[Array, " b"]]:
         image = mass(x)
@@ -92,7 +95,7 @@ def definite_product(
 
 
 def first_beyond(values: Values) -> Scalar:
-    """Estimate Λ, the first eigenvalue on the complement, given computed eigenvalues; the last must be positive."""
+    """Estimate the lowest eigenvalue Λ beyond the computed eigenvalues, of which the largest must be positive."""
     return values[-1] * (1 + 1 / values.size)
 
 
@@ -104,14 +107,17 @@ def amplification(values: Values, k: int) -> OfRows:
 
 # The tolerance is relative to the right-hand sides bᵢ before the projection Q = I − MΦΦᵀ. The projections Qbᵢ may be
 # pure rounding errors. For example, if the tensors T change by a multiple of T, dK and dM are multiples of K and M, so
-# that bᵢ is a multiple of Mφᵢ and Qbᵢ = 0. Such noise lies mostly in the span of MΦ, so that a solution with a small
-# error relative to the noise does not exist. Therefore such a row counts as zero. The same holds in reverse mode, where
-# the bᵢ are cotangents of the solutions. For example, if all nodes have equal weights, the bᵢ are multiples of Mφᵢ.
+# that bᵢ is a multiple of Mφᵢ and Qbᵢ = 0. Rounding errors in Qbᵢ lie mostly in the span of MΦ, and not in the image of
+# the complement under K − λᵢM, so that no solution is accurate relative to these errors. Therefore a projection Qbᵢ at
+# the level of rounding counts as zero. In reverse mode, where bᵢ is a cotangent of the eigenvector φᵢ, Qbᵢ may also be
+# pure rounding errors. For example, if a loss is the integral of a signature over the domain, each bᵢ is a multiple of
+# Mφᵢ.
 #
-# Small rows need fewer correct digits, or none, because they contribute little to sums over all rows. Rows with λᵢ near
-# Λ have a larger weight, because the inverse amplifies them.
+# Small right-hand sides need fewer correct digits, or none, because their solutions contribute little to sums over all
+# i. Right-hand sides with λᵢ near the lowest eigenvalue Λ on the complement need more correct digits, because
+# (K − λᵢM)⁻¹ amplifies them.
 def wanted_errors(before: OfRows, after: OfRows, amplified: OfRows, tolerance: float, dtype: Any) -> OfRows:
-    """Return the wanted errors in the energy norm, relative to each row's own norm; infinite for rows that are zero.
+    """Return each row's wanted relative error in the energy norm, or infinity for a row that counts as zero.
 
     Args:
         before: the `norms` of the right-hand sides bᵢ.
@@ -121,7 +127,6 @@ def wanted_errors(before: OfRows, after: OfRows, amplified: OfRows, tolerance: f
         dtype: the dtype to which eigenvectors and rows were rounded.
     """
     xp, largest = amplified.__array_namespace__(), before.max()
-    # If all rows are zero, each row counts as zero.
     share = after / xp.where(largest > 0, largest, 1) * amplified
     noise = (after <= attainable(0, dtype) * before) | (share <= tolerance)
     return xp.where(noise, xp.inf, xp.minimum(tolerance / xp.where(noise, 1, share), 0.1))
@@ -138,8 +143,10 @@ def group_numbers(
 ) -> Int[np.ndarray, " m"]:
     """Divide distances into groups in geometric progression, and return the group of each distance.
 
-    The distances are Λ − λᵢ. If the largest is ρ times the least, the preconditioned matrix of each of s groups has the
-    condition number ρ^(1/2s). The number s minimises the cost of factorisations and of steps for all rows.
+    The distance of an eigenvalue λᵢ is Λ − λᵢ, where Λ is the lowest eigenvalue on the complement. If the largest
+    distance is ρ times the least distance, and the distances are divided into s groups, the condition number of each
+    group's preconditioned matrix is at most ρ^(1/2s). The number s of groups minimises the cost of factorisations and
+    of steps for all rows.
     """
     ratio = max(distance.max() / distance.min(), 1 + 1e-12)
 
@@ -152,7 +159,7 @@ def group_numbers(
 
 
 def shifts_between(values: Values, nearest: Shifts, farthest: Shifts) -> Shifts:
-    """Return a shift for each group: its distance from Λ is the geometric mean of the group's extreme distances."""
+    """Return each group's shift, whose distance from `first_beyond` is about √(``nearest`` · ``farthest``)."""
     xp = values.__array_namespace__()
     targets, below = first_beyond(values) - xp.sqrt(nearest * farthest), -0.1 * values[-1]
     if values.size == 1:
@@ -190,7 +197,7 @@ def without_known(pencil: SymmetricPencil, vectors: Vectors) -> OfColumns:
 def projected(
     pencil: SymmetricPencil, vectors: Vectors, rhs: Rows, tolerance: float, amplified: OfRows
 ) -> tuple[Rows, OfRows]:
-    """Return Q rhs, where Q = I − MΦΦᵀ, and the `wanted_errors` of its rows."""
+    """Return the projections Q rhsᵢ, where Q = I − MΦΦᵀ, and the wanted relative error of each solution."""
     lumped = pencil.mass.diagonal()
 
     def project(b: Rows, _: Array) -> tuple[Rows, OfRows]:
@@ -226,14 +233,14 @@ def _in_parts(project: Callable[..., tuple[Array, ...]], *rows: Array) -> tuple[
 
 
 def solve_in_blocks(
-    solver_of: Callable[[Int[Array, ""]], Callable[..., Columns]],  # group ↦ (rhs, wanted, *of_rows) ↦ x of one block
+    solver_of: Callable[[Int[Array, ""]], Callable[..., Columns]],  # returns the solver for a group's blocks
     size: int,  # the number of rows per block
     first: Int[np.ndarray, " groups"],  # the first row of each group of blocks
     rhs: Rows,
-    wanted: OfRows,  # the wanted error of each row; if infinite, the row is not solved
+    wanted: OfRows,  # the wanted error of each solution; if infinite, the solution is zero
     *of_rows: OfRows,
 ) -> Rows:
-    """Solve for blocks of rows, one after another."""
+    """Solve the linear systems for blocks of right-hand sides (rows), one block after another."""
     size = min(size, len(rhs))
     starts, _ = row_blocks(len(rhs), size)
     blocks = jnp.asarray(np.append(first // size, len(starts)))
