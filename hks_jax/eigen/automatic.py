@@ -54,9 +54,8 @@ def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensol
 def choose_for_fit(pencil: AnyPencil, k: int) -> Eigensolver:
     """Return the solver that ``"auto"`` chooses in a fit.
 
-    At each iterate, a fit of tensors to data multiplies many vectors by the Jacobian. The linear solver that block
-    Lanczos uses for derivatives shares its factorisations among all products with one Jacobian; the Chebyshev filter
-    has no factorisations. The values of a fit are traced, so the solver must not run on the host.
+    A fit multiplies many vectors by each Jacobian. The linear solver of block Lanczos reuses its factorisations in all
+    products with one Jacobian. The values of a fit are traced, so the solver must not run on the host.
     """
     n, fitting = pencil.space.n_dof, BlockLanczos(adjoint=FactorisedAdjoint(1e-5, solves=20))
     return fitting if n > _SMALL and k + 20 <= fitting.max_pairs(n) else Dense()

@@ -39,11 +39,10 @@ def solved(
     """Return k eigenvalues, their eigenvectors, these vectors as a frame, the next eigenvalue, and a certified bound.
 
     The pairs are the k lowest eigenpairs or, if ``interior``, the first k above the origin of a `LocatedPencil`. The
-    frame is a copy of the eigenvectors whose derivative excludes rotations of the k eigenvectors among themselves. The
-    next eigenvalue is infinite unless ``extra`` = 1. The solver certifies that no eigenvalue below the bound is
-    missing. Derivatives treat the next eigenvalue and the bound as constants. A derivative whose linear solves do not
-    converge is NaN. If linear solves do not converge, an error is raised if ``throw`` is set, and otherwise a warning
-    is given if values are concrete.
+    derivative of the frame excludes rotations of the k eigenvectors among themselves. The next eigenvalue is infinite
+    unless ``extra`` = 1. The solver certifies that none of the k eigenvalues is missing below the bound. Derivatives
+    treat the next eigenvalue and the bound as constants. Derivatives whose linear solves do not converge are NaN, and
+    raise an error if ``throw`` is set, or else cause a warning if values are concrete.
     """
     values, vectors, complete_below = _computed(solver, pencil, k, extra, interior, report)
     values, vectors, following = _cut(values, vectors, k)
@@ -54,26 +53,23 @@ def solved(
 #
 #     dλᵢ = φᵢᵀfᵢ,    dφᵢ = −½ (φᵢᵀ dM φᵢ) φᵢ + Σ_{j≠i} φⱼ (φⱼᵀfᵢ)/(λᵢ − λⱼ).
 #
-# The sum in dφᵢ is over all eigenvectors φⱼ except φᵢ; the terms for computed eigenvectors are evaluated directly. In
-# dφᵢ, the sum xᵢ of the terms for all eigenvectors that were not computed solves
+# The terms of dφᵢ for computed eigenvectors φⱼ are evaluated directly. The sum xᵢ of all other terms of dφᵢ solves
 #
 #     (K − λᵢM) xᵢ = −Q fᵢ,   Φᵀ M xᵢ = 0,   Q = I − MΦΦᵀ,
 #
-# on the M-orthogonal complement of the computed eigenvectors Φ. On the complement of the computed eigenvectors, K − λᵢM
-# is positive definite. Reverse mode uses the symmetry of the map fᵢ ↦ xᵢ. The solver computes some guard pairs beyond
-# k, so that λᵢ is not close to the eigenvalues on the complement of the computed eigenvectors. In the interior of a
-# spectrum, this complement has eigenvalues on both sides of λᵢ. So in the interior of a spectrum, guard pairs lie on
-# both sides: at most half of them below the origin, and the others after the k pairs.
+# on the M-orthogonal complement of the computed eigenvectors Φ, where K − λᵢM is positive definite. Reverse mode uses
+# the symmetry of the map fᵢ ↦ xᵢ. The solver computes some guard pairs beyond k, so that λᵢ is not close to the
+# eigenvalues on the complement of Φ. In the interior of a spectrum, the complement of Φ has eigenvalues on both sides
+# of λᵢ. So in the interior, at most half of the guard pairs lie below the origin, and the others follow the k pairs.
 #
 # If λᵢ = λⱼ and j ≠ i, the coefficient of φⱼ in dφᵢ is arbitrary (a gauge), because every basis of the eigenspace is
-# valid. The derivative rule sets a gauge coefficient to −½ φⱼᵀ dM φᵢ, which keeps Φ M-orthonormal and is never NaN. The
-# rule also treats the coefficient of φⱼ as a gauge if |λᵢ − λⱼ| is below √ε (λ − λ₀), where λ is the larger of the two
-# eigenvalues and λ₀ the lowest of all, because a division by so small a gap would lose all digits. So dφᵢ is a
-# derivative only if λᵢ is simple. For equal eigenvalues, only the sum of their dλᵢ has a meaning. Spectral functions do
-# not depend on the basis of an eigenspace, so their derivatives must not contain gauge coefficients. Therefore
-# derivatives of spectral functions use the frame, whose derivative contains only the terms for j > k of the sum in dφᵢ
-# (hks_jax/signatures/spectral_functions.py). For users, `of_simple` replaces derivatives of eigenvectors that contain a
-# gauge coefficient by NaN.
+# valid. The derivative rule sets gauge coefficients to −½ φⱼᵀ dM φᵢ, which keeps Φ M-orthonormal and is never NaN. A
+# coefficient also counts as a gauge if |λᵢ − λⱼ| is below √ε (λ − λ₀), where λ is the larger of the two eigenvalues and
+# λ₀ the lowest of all, because a division by so small a gap would lose all digits. So dφᵢ is a derivative only if λᵢ is
+# simple. For equal eigenvalues, only the sum of their dλᵢ has a meaning. Spectral functions do not depend on the basis,
+# so their derivatives must not contain gauge coefficients. Derivatives of spectral functions use the frame, whose
+# derivative has only the terms of dφᵢ with j > k (hks_jax/signatures/spectral_functions.py). `of_simple` replaces
+# eigenvector derivatives with gauge coefficients by NaN.
 @solved.defjvp
 def _solved_jvp(
     solver: Eigensolver, k: int, extra: int, interior: bool, throw: bool, report: Report, primals: Any, changes: Any
@@ -98,7 +94,6 @@ def _solved_jvp(
 def _computed(
     solver: Eigensolver, pencil: SymmetricPencil, k: int, spare: int, interior: bool, report: Report
 ) -> RawPairs:
-    """Return the k wanted pairs, ``spare`` further pairs, and the bound below which no eigenvalue is missing."""
     if interior:
         return one_by_one(first_from_origin, (solver, k, spare, report), pencil)
     values, vectors, bound = one_by_one(_lowest, (solver, k + spare, report), pencil)
@@ -109,7 +104,6 @@ def _computed(
 
 @numpy_where_known(static_argnums=2)
 def _cut(xp: Any, values: Any, vectors: Any, k: int) -> tuple[Any, Any, Any]:
-    """Return the first k pairs, and the next eigenvalue, or infinity if there is none."""
     return values[:k], vectors[:k], values[k] if len(values) > k else xp.asarray(xp.inf, values.dtype)
 
 
@@ -213,9 +207,8 @@ def tangents_of(
     frame = with_transpose(onto_guards, onto_guards, force)
     if _solves(pencil, k, len(values)):
         # If every perturbation of K annihilates a null vector φᵢ, its force fᵢ is zero, and so is xᵢ. In reverse mode,
-        # the right-hand side for such a null vector is a cotangent, which may be nonzero; so its solution is set to
-        # zero. JAX needs products with K − λᵢM only for second derivatives, so the identity replaces K − λᵢM as the
-        # matrix of the linear solve.
+        # a cotangent that may be nonzero replaces fᵢ, so xᵢ is set to zero for such null vectors. JAX needs products
+        # with K − λᵢM only for second derivatives, so the linear solve gets the identity instead of K − λᵢM.
         free = np.arange(k)[:, None] >= pencil.n_fixed
         rhs = jnp.where(free, -force, 0)
         frame = frame + jnp.where(free, jax.lax.custom_linear_solve(lambda x: x, rhs, solve, symmetric=True), 0)
@@ -278,7 +271,6 @@ def frame_of_chosen(vectors: Rows, mass: Operator, chosen: Bool[Array, " k"]) ->
     """Return the vectors, with a derivative that excludes rotations of the chosen vectors among themselves.
 
     The derivative contains rotations of the chosen vectors towards the vectors that are not chosen.
-    vectors.
     """
     return vectors
 
@@ -305,10 +297,9 @@ def of_simple(
     return vectors
 
 
-# For equal eigenvalues λᵢ = λⱼ = λ, the derivative of the spectral function Σᵢ f(λᵢ) φᵢ(x)² contains the terms f'(λ) φᵢ
-# φⱼ φᵢᵀ(dK − λ dM)φⱼ. The derivatives dλᵢ give only the terms with i = j. Rotations of the eigenvectors of λ among
-# themselves give no terms, because they do not change the sum of φᵢ(x)² over these eigenvectors. So no finite
-# derivative of the eigenvectors of λ gives the terms with i ≠ j.
+# For equal eigenvalues λᵢ = λⱼ = λ, the derivative of Σᵢ f(λᵢ) φᵢ(x)² contains f'(λ) φᵢ φⱼ φᵢᵀ(dK − λ dM)φⱼ. The
+# derivatives dλᵢ give only the terms with i = j. Rotations of the eigenvectors of λ give no terms, because they do not
+# change the sum of their φᵢ(x)². So no finite derivative of eigenvectors gives the terms with i ≠ j.
 @of_simple.defjvp
 def _of_simple_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     vectors, values, following, kept, part, pencil = primals

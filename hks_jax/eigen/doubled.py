@@ -23,10 +23,10 @@ def solve_doubled(
 ) -> Eigenpairs:
     """Return the k lowest pairs of a doubled domain, from the problems of its parts; ``extra`` = 1 adds one eigenvalue.
 
-    For traced values, the solver computes for each part of the pencil the largest number of pairs that this part can
-    have among the k lowest pairs of the doubled domain (`_limits`). For concrete values, the solver first computes for
-    each part an equal share of the k pairs plus a margin, and doubles this share while pairs of the part may be
-    missing. By Weyl's law, boundary conditions change the number of a part's pairs among the k lowest by about √k.
+    For traced values, each part's problem is solved for the largest number of pairs that this part can have among the k
+    lowest (`_limits`). For concrete values, each part's problem is first solved for an equal share of the k pairs plus
+    a margin, and again for twice as many pairs while some of its pairs may be missing. The margin is about 2√k, because
+    by Weyl's law boundary conditions change the number of a part's pairs among the k lowest by about √k.
     """
     parts, total = pencil.parts, k + extra
     whole, limits = widened(pencil, solvers, total), _limits(pencil, total)
@@ -128,9 +128,8 @@ def _complete_below(
 ) -> Float[Array, ""]:
     """Return the bound below which no eigenvalue of the doubled domain is missing.
 
-    The solver of a part may certify only that no eigenvalue is missing below the part's last computed eigenvalue. A
-    part with as many computed pairs as `_limits` allows has no further eigenvalue below ``reach``, the largest of the
-    ``total`` lowest eigenvalues of the doubled domain.
+    A part's solver may certify completeness only below the part's last computed eigenvalue. But a part with as many
+    pairs as `_limits` allows has no further eigenvalue below ``reach``, the last of the ``total`` lowest eigenvalues.
     """
     bounds = []
     for pairs, limit in zip(solved, _limits(pencil, total), strict=True):

@@ -47,16 +47,15 @@ class Eigenpairs(eqx.Module):
         eigenvalues: (k,) in ascending order, in 1/(metric length)²; exactly 0 for null vectors.
         vectors: (k, n_dof) coefficients of the eigenfunctions, with φᵢᵀMφⱼ = δᵢⱼ. For the boundaries "mirror" and
             "mean", M is the mass of the domain doubled m times; on the domain itself, the norm of each φᵢ is 1/√2ᵐ.
-        frame: (k, n_dof) the values of `vectors`, but with a derivative that excludes rotations of the k eigenvectors
-            among themselves, which are singular at multiple eigenvalues. Derivatives of signatures add the effect of
-            these rotations by divided differences.
+        frame: (k, n_dof) the values of `vectors`, but with a derivative that excludes rotations of eigenvectors among
+            themselves, which are singular at multiple eigenvalues. Derivatives of signatures include the effect of such
+            rotations by divided differences.
         residuals: (k,) ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁), where λ₁ is the first positive eigenvalue. In an interval, or if
             the null space is unknown, max(λ, λ₁) is replaced by the larger of two numbers: the mean gap of the
             eigenvalues, and the distance of λ from `spectral_origin`.
         converged: (k,) whether the residual is at most the solver's tolerance, or at most the level of rounding.
-        kept: (k,) whether each pair belongs to the truncated spectrum; signatures ignore the other pairs. The options
-            ``multiplet="drop"`` and ``"complete"`` may exclude the last pairs; `of_part` keeps the pairs of one part
-            only.
+        kept: (k,) whether each pair belongs to the truncated spectrum; signatures ignore the other pairs. The choices
+            ``multiplet="drop"`` and ``"complete"`` may exclude the last pairs; `of_part` keeps only one part's pairs.
         part: (k,) for the boundaries "mirror" and "mean", the index of the pencil's part that each pair belongs to (0
             is the Neumann problem); otherwise None.
         next_eigenvalue: the first eigenvalue that is not kept; infinite if it does not exist or was not computed, as
@@ -161,8 +160,7 @@ class Eigenpairs(eqx.Module):
     def unconfirmed(self) -> Bool[Array, ""]:
         """Whether the solver's certificate ends below the last kept eigenvalue.
 
-        For the lowest pairs of a spectrum with a known lower bound, `unconfirmed` is false if `complete_below` is NaN,
-        because some solvers give no certificate.
+        If a lower bound of the spectrum is known, no certificate is needed, because some solvers give none.
         """
         if not self.k:
             return jnp.zeros((), bool)
@@ -172,7 +170,7 @@ class Eigenpairs(eqx.Module):
 
     @property
     def result(self) -> RESULTS:
-        """The code of the most serious failure; traceable. Compare it with ``RESULTS.successful``."""
+        """The traceable code of the most serious failure, for a comparison with ``RESULTS.successful``."""
         finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(self.pencil) if eqx.is_inexact_array(leaf)]
         code: Any = RESULTS  # mypy sees its members as strings
         result = code.where(self.unconfirmed, code.unconfirmed, code.successful)
@@ -291,7 +289,6 @@ def truncate(pairs: Eigenpairs, k: int, multiplet: MultipletChoice) -> Eigenpair
 def _choose(
     xp: Any, values: Any, following: Any, origin: Any, tolerance: Any, k: int, multiplet: MultipletChoice
 ) -> tuple[Any, Any]:
-    """Return a mask (n) of the kept pairs, and the first eigenvalue that is not kept."""
     size = len(values)
     sequence = xp.append(values, following)
     index = xp.arange(size)

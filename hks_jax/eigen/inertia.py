@@ -155,8 +155,6 @@ def translated(
 
 
 class _Descent(NamedTuple):
-    """The state of the search in `lowered` for a distance below the origin."""
-
     near: Scalar  # the largest distance below the origin that is known to contain at most ``most`` eigenvalues
     number: Number  # the number of eigenvalues within the distance `near` below the origin
     far: Scalar  # the least distance below the origin that is known to contain more than ``most`` eigenvalues
@@ -168,9 +166,8 @@ class _Descent(NamedTuple):
 def lowered(pencil: LocatedPencil, most: int, probes: int) -> tuple[Scalar, Number]:
     """Return a distance below the origin, and the number of eigenvalues within it, from ``most``/2 to ``most``.
 
-    The number of eigenvalues is less than ``most``/2 if no more exist below the origin, or if the next eigenvalue is
-    multiple and would raise the number above ``most``. Random right-hand sides, ``probes`` in number, test each
-    factorisation.
+    The number of eigenvalues is less than ``most``/2 if no more exist below the origin, or if a multiple eigenvalue
+    would raise it above ``most``. Each factorisation is tested with ``probes`` random right-hand sides.
     """
     count, dtype = _counting(pencil, probes), pencil.stiffness.dtype
 
@@ -242,8 +239,7 @@ def _narrowed(state: _Search, count: Number, sound: Flag, size: Scalar, least: S
     high, number = jnp.where(lower, state.next, state.high), jnp.where(lower, count, state.number)
     first = jnp.where(lower & (count != state.number), state.next, state.first)
     share = jnp.clip(wanted / jnp.maximum(number, 1).astype(dtype), 1 / 16, 1 / 2)
-    # If the bracket has no lower end yet, the next shift is lower; if it has no upper end yet, the next shift is
-    # higher.
+    # If the bracket has no lower end yet, the shift decreases; if it has no upper end yet, the shift increases.
     down, up = jnp.minimum(-size, 4 * state.next), 4 * jnp.maximum(low, 0) + size * wanted / n
     bracketed = jnp.isfinite(low) & jnp.isfinite(high)
     following = jnp.where(bracketed, low + share * (high - low), jnp.where(jnp.isfinite(high), down, up))

@@ -52,8 +52,8 @@ class Eigensolver(eqx.Module, Generic[P]):
     Attributes:
         name: the name of the method in reports.
         indefinite: whether the method supports a stiffness that is indefinite, or whose null space is unknown.
-        adjoint: the linear solver for derivatives. The default, `FactorisedAdjoint`, supports all pencils with a
-            factorisation.
+        adjoint: the linear solver for derivatives. The default, `FactorisedAdjoint`, needs a pencil that it can
+            factorise.
         tolerance: the relative residual ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁) at which a pair counts as converged, or the
             level of rounding if that is larger.
     """
@@ -70,8 +70,8 @@ class Eigensolver(eqx.Module, Generic[P]):
     def lowest(self, pencil: P, k: int, report: Report = silent) -> RawPairs:
         """Return the k lowest eigenvalues (ascending), M-orthonormal eigenvectors (as rows), and a certified bound.
 
-        No eigenvalue below the bound is missing. Pairs that were not found are NaN, and the bound is NaN if there is no
-        certificate. The method works under `jit` and `vmap`; outside `jit`, it may report progress.
+        None of the k lowest eigenvalues is missing below the bound. Pairs that were not found are NaN, and the bound is
+        NaN if there is no certificate. The method works under `jit` and `vmap`; outside `jit`, it may report progress.
         """
 
     def guards(self, k: int, n_dof: int) -> int:

@@ -35,10 +35,9 @@ def weyl_count(
     """Estimate the number of eigenvalues below each of several values, by Weyl's law.
 
     In 2D, N(λ) ≈ (A λ ± L √λ)/4π, where A is the area and L is the length of the boundary. In 3D, N(λ) ≈ V λ^(3/2)/6π²
-    ± S λ/16π, where V is the volume and S is the area of the boundary. The sign of the boundary term is plus for a
-    natural boundary, and minus for a Dirichlet boundary (Ivrii 1980). For a mask, L or S is the measure of the
-    staircase of element faces on the boundary. Eigenfunctions resolve the steps of this staircase only if √λ times the
-    node spacing is close to 1.
+    ± S λ/16π, where V is the volume and S is the area of the boundary. The boundary term is positive for a natural
+    boundary, and negative for a Dirichlet boundary (Ivrii 1980). For a mask, L or S is the measure of a staircase of
+    element faces, whose steps eigenfunctions resolve only if √λ times the node spacing is close to 1.
 
     Args:
         problem: the result of `eigenpairs` or `assemble`, which has volume, dimension and boundary conditions.

@@ -1,12 +1,11 @@
 """The interface of linear solvers for derivatives of eigenpairs, and their common functions, in NumPy or JAX.
 
-The derivatives of k eigenpairs need linear solves with K − λᵢM on the M-orthogonal complement of the p ≥ k lowest
-eigenvectors. If the shift σ is below the lowest eigenvalue Λ on the complement of the p computed eigenvectors, K − σM
-is positive definite on this complement, even if it is indefinite on the whole space. Preconditioning with K − σM maps
-the spectrum of K − λᵢM on the complement to the interval between 1 and (Λ − λᵢ)/(Λ − σ). Right-hand sides are the rows
-of an array. The right-hand sides of similar eigenvalues λᵢ form a group with its own shift σ, so that a few
-factorisations of K − σM suffice for fast convergence. `HostAdjoint` uses SciPy's factorisations, `FactorisedAdjoint`
-uses factorisations in JAX, and `FilteredAdjoint` uses a polynomial.
+Derivatives of eigenpairs need linear solves with K − λᵢM on the M-orthogonal complement of the p lowest eigenvectors.
+For every shift σ below the lowest eigenvalue Λ on the complement of the p eigenvectors, K − σM is positive definite on
+the complement, even if it is indefinite on the whole space. Preconditioning with K − σM maps the spectrum of K − λᵢM on
+the complement to the interval between 1 and (Λ − λᵢ)/(Λ − σ). Each group of right-hand sides with similar λᵢ has its
+own shift σ, so that a few factorisations of K − σM suffice for fast convergence. `HostAdjoint` uses SciPy's
+factorisations, `FactorisedAdjoint` uses factorisations in JAX, and `FilteredAdjoint` uses a polynomial.
 """
 
 from abc import abstractmethod
@@ -42,8 +41,7 @@ SINGULAR = 1e-8
 _LEAST = 100
 """In units of ε: the least relative tolerance, and the relative norm below which a projected row counts as zero."""
 _FACTORISATION = 200
-"""The cost of a factorisation of K − σM, in units of one conjugate gradient step for one right-hand side. The true cost
-of about 100 steps is doubled, because small right-hand sides take few steps."""
+"""Twice the cost of a factorisation of K − σM, in units of one conjugate gradient step for one right-hand side."""
 _MOST_GROUPS = 16
 _ROWS = 128
 """The number of rows projected together; with fewer rows, the eigenvectors are read from memory more often."""
@@ -84,8 +82,8 @@ def attainable(tolerance: float, dtype: Any) -> float:
 def definite_product(
     stiffness: Callable[[Array], Array], mass: Callable[[Array], Array], shifts: Float[Array, " b"], beyond: Scalar
 ) -> Callable[[Columns], tuple[Columns, Float[Array, " b"]]]:
-    """Return the function of columns xᵢ that returns (K − λᵢM) xᵢ and, for each column, the energy xᵢᵀ(K − λᵢM)xᵢ below
-    which the matrix K − λᵢM counts as singular."""
+    """Return the function that maps columns xᵢ to (K − λᵢM) xᵢ, and to the energies xᵢᵀ(K − λᵢM)xᵢ below which the
+    matrices K − λᵢM count as singular."""
 
     def product(x: Columns) -> tuple[Columns, Float[Array, " b"]]:
         image = mass(x)
@@ -107,15 +105,13 @@ def amplification(values: Values, k: int) -> OfRows:
 
 # The tolerance is relative to the right-hand sides bᵢ before the projection Q = I − MΦΦᵀ. The projections Qbᵢ may be
 # pure rounding errors. For example, if the tensors T change by a multiple of T, dK and dM are multiples of K and M, so
-# that bᵢ is a multiple of Mφᵢ and Qbᵢ = 0. Rounding errors in Qbᵢ lie mostly in the span of MΦ, and not in the image of
-# the complement under K − λᵢM, so that no solution is accurate relative to these errors. Therefore a projection Qbᵢ at
-# the level of rounding counts as zero. In reverse mode, where bᵢ is a cotangent of the eigenvector φᵢ, Qbᵢ may also be
-# pure rounding errors. For example, if a loss is the integral of a signature over the domain, each bᵢ is a multiple of
-# Mφᵢ.
+# that bᵢ is a multiple of Mφᵢ and Qbᵢ = 0. Rounding errors in Qbᵢ lie mostly in the span of MΦ, so that no solution is
+# accurate relative to these errors. Therefore a projection Qbᵢ at the level of rounding counts as zero. Also in reverse
+# mode, where bᵢ is a cotangent of φᵢ, the projection Qbᵢ may be pure rounding errors. For example, if the loss is the
+# integral of a signature over the domain, bᵢ is a multiple of Mφᵢ.
 #
-# Small right-hand sides need fewer correct digits, or none, because their solutions contribute little to sums over all
-# i. Right-hand sides with λᵢ near the lowest eigenvalue Λ on the complement need more correct digits, because
-# (K − λᵢM)⁻¹ amplifies them.
+# Right-hand sides need fewer correct digits if they are small, because they contribute little to sums over all i, and
+# more if λᵢ is near the lowest eigenvalue Λ on the complement, because (K − λᵢM)⁻¹ amplifies them.
 def wanted_errors(before: OfRows, after: OfRows, amplified: OfRows, tolerance: float, dtype: Any) -> OfRows:
     """Return each row's wanted relative error in the energy norm, or infinity for a row that counts as zero.
 
@@ -144,9 +140,8 @@ def group_numbers(
     """Divide distances into groups in geometric progression, and return the group of each distance.
 
     The distance of an eigenvalue λᵢ is Λ − λᵢ, where Λ is the lowest eigenvalue on the complement. If the largest
-    distance is ρ times the least distance, and the distances are divided into s groups, the condition number of each
-    group's preconditioned matrix is at most ρ^(1/2s). The number s of groups minimises the cost of factorisations and
-    of steps for all rows.
+    distance is ρ times the least, each of s groups has a preconditioned matrix with a condition number of at most
+    ρ^(1/2s). The number s minimises the cost of factorisations and of steps for all right-hand sides.
     """
     ratio = max(distance.max() / distance.min(), 1 + 1e-12)
 
@@ -219,7 +214,6 @@ def cleaned(pencil: SymmetricPencil, vectors: Vectors, x: Rows) -> Rows:
 
 
 def _in_parts(project: Callable[..., tuple[Array, ...]], *rows: Array) -> tuple[Array, ...]:
-    """Project blocks of rows, one after another. The last block may overlap another, which is harmless."""
     size = even_size(len(rows[0]), _ROWS)
     starts, _ = row_blocks(len(rows[0]), size)
 

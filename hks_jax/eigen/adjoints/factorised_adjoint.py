@@ -109,8 +109,7 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         return x if clean_enough else complement.cleaned(pencil, vectors, x)
 
     def groups(self, dissection: Dissection, p: int, k: int, dtype: np.dtype) -> Groups:
-        """Divide the k right-hand sides into groups by `group_numbers`; return the first and the last row of each
-        group."""
+        """Return the first and the last row of each group of right-hand sides, which `group_numbers` determines."""
         start = np.arange(0, k, BLOCK)
         end = np.minimum(start + BLOCK, k)
         distance = self._distance(p, k, (start + end - 1) / 2)
@@ -133,10 +132,9 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
     def _amplified(self, pencil: Any, values: Values, k: int) -> OfRows:
         return complement.amplification(values, k)
 
-    # If rounding leaves a component of the residual r along a computed eigenvector φⱼ, the product with
-    # (K − λᵢM)(K − σM)⁻¹ multiplies this component by (λⱼ − λᵢ)/(λⱼ − σ). The factor (λⱼ − λᵢ)/(λⱼ − σ) is large mainly
-    # for λⱼ near σ. So each step projects out only the eigenvectors φⱼ with λⱼ nearest to σ. The other φⱼ are projected
-    # out at restarts and at the end.
+    # If rounding leaves a component of the residual along a computed eigenvector φⱼ, each step multiplies this
+    # component by (λⱼ − λᵢ)/(λⱼ − σ), which is large mainly for λⱼ near σ. So each step projects out only the
+    # eigenvectors φⱼ with λⱼ nearest to σ. The other φⱼ are projected out at restarts and at the end.
     def _solve_block(
         self, pencil: Any, values: Values, without_near: OfColumns, without_known: OfColumns, *of_block: Any
     ) -> Columns:
@@ -151,23 +149,21 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
 
 
 # The eigenvalues on the complement of the computed eigenvectors lie on both sides of the computed eigenvalues, so that
-# K − λᵢM is indefinite on the complement. Let Λ₋ be the last eigenvalue on the complement below the computed
-# eigenvalues, and Λ₊ the first above them. Let the shift σ, like λᵢ, lie between Λ₋ and Λ₊. Then every eigenvalue λⱼ on
-# the complement is above both σ and λᵢ, or below both. So the preconditioned matrix
+# K − λᵢM is indefinite. Let Λ₋ be the last eigenvalue on the complement below the computed ones, and Λ₊ the first
+# above. Let the shift σ, like λᵢ, lie between Λ₋ and Λ₊. Then each λⱼ on the complement is above both σ and λᵢ, or
+# below both. So
 #
 #     A = (K − σM)⁻¹ (K − λᵢM)
 #
-# has the eigenvalues (λⱼ − λᵢ)/(λⱼ − σ) > 0 on the complement. A is symmetric in the inner product xᵀMy. So conjugate
-# gradients in the inner product xᵀMy solve A xᵢ = (K − σM)⁻¹ bᵢ, where bᵢ is the right-hand side and xᵢ the solution.
-# Products with A use the exact K − λᵢM. So an inaccurate factorisation of K − σM slows down convergence, but does not
-# change the solution.
+# has the eigenvalues (λⱼ − λᵢ)/(λⱼ − σ) > 0 on the complement. A is symmetric in the inner product xᵀMy, in which
+# conjugate gradients solve A xᵢ = (K − σM)⁻¹ bᵢ for the right-hand side bᵢ. Products with A use the exact K − λᵢM. So
+# an inaccurate factorisation of K − σM slows down convergence, but does not change the solution.
 #
-# Define the odds ω(λ) = (Λ₊ − λ)/(λ − Λ₋) of an eigenvalue λ between Λ₋ and Λ₊. The condition number of the
-# preconditioned matrix A is at most the ratio of the larger to the smaller of the odds ω(λᵢ) and ω(σ). For example, if
-# λᵢ < σ, the eigenvalues of A lie between (λᵢ − Λ₋)/(σ − Λ₋) and (Λ₊ − λᵢ)/(Λ₊ − σ). For groups of right-hand sides,
-# the odds ω(λᵢ) replace the distances Λ₊ − λᵢ, and are proportional to these distances in the limit Λ₋ → −∞. The limits
-# between the groups divide the range of the odds ω(λᵢ) in geometric progression, and the odds ω(σ) of a group's shift
-# are the geometric mean of its extreme odds.
+# Define the odds ω(λ) = (Λ₊ − λ)/(λ − Λ₋) of an eigenvalue λ. The condition number of the preconditioned matrix A is at
+# most the ratio of the odds ω(λᵢ) and ω(σ); for example, if λᵢ < σ, the eigenvalues of A lie between (λᵢ − Λ₋)/(σ − Λ₋)
+# and (Λ₊ − λᵢ)/(Λ₊ − σ). `group_numbers` divides the odds ω(λᵢ), instead of the distances Λ₊ − λᵢ, into groups; the
+# odds ω(σ) of a group's shift are the geometric mean of its extreme odds. In the limit Λ₋ → −∞, the odds ω(λᵢ) are
+# proportional to the distances Λ₊ − λᵢ.
 class InteriorAdjoint(FactorisedAdjoint):
     """Conjugate gradients in the inner product of M, with a factorisation of K − σM for each group of rows.
 

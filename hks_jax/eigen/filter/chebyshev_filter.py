@@ -177,8 +177,8 @@ class Pace:
         if not self._factor > 1 or not self._excess > 1:
             return None
         rounds = math.ceil(math.log(self._excess) / math.log(self._factor))
-        # Each round filters fewer pairs than the round before. So the number of products in the current round, if
-        # known, is a better estimate for later rounds than the number of products in the previous round.
+        # Later rounds filter fewer pairs. So the number of products in the current round, if known, is a better
+        # estimate for later rounds than the number in the previous round.
         return (rounds - done / self._work) * self._seconds * self._work / self._last_work
 
 
@@ -193,5 +193,4 @@ def _nested(pencil: Pencil, plan: Plan) -> list[NodalPencil]:
 
 
 def _replicated(mesh: Mesh | None, grid: GridFilter) -> GridFilter:
-    """Copy the arrays to every device."""
     return grid if mesh is None else jax.jit(lambda x: x, out_shardings=NamedSharding(mesh, EVERYWHERE))(grid)

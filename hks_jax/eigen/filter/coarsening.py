@@ -17,7 +17,6 @@ from hks_jax.fem.space import axis_colours
 from hks_jax.fem.stencil import Stencil
 
 _COLUMNS = 16
-"""The number of columns by which the stiffness and mass of the fine grid are multiplied at once."""
 
 
 @jax.jit
@@ -29,9 +28,8 @@ def coarsen(fine: NodalPencil) -> NodalPencil:
     axes = [axis_colours(n, 3, wraps) for n, wraps in zip(shape, fine.periodic, strict=True)]
     counts = [int(axis.max()) + 1 for axis in axes]
     padded = -(-math.prod(counts) // _COLUMNS) * _COLUMNS
-    # Neighbouring nodes have different colours; the colour of a neighbour that does not exist is −1. The constants of
-    # the compiled program are only the colours along each single axis, because `optimization_barrier` keeps XLA from
-    # combining these colours into constants for all nodes.
+    # Neighbouring nodes have different colours; the colour of a neighbour that does not exist is −1. The barriers keep
+    # XLA from computing constants for all nodes from the colours along single axes, which are constants of the program.
     colours = jnp.zeros((), jnp.float32)
     along = jax.lax.optimization_barrier([jnp.asarray(axis, jnp.float32) for axis in axes])
     for axis, (own, count) in enumerate(zip(along, counts, strict=True)):

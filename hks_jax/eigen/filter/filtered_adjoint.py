@@ -23,8 +23,7 @@ from hks_jax.fem.stencil import StencilOperator
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
 
 _GAIN = 20.0
-"""The filter polynomial's value at λᵢ. With a larger value, each step takes more products with K; with a smaller value,
-more steps are needed, and each step takes a projection."""
+"""The filter polynomial's value at λᵢ. A larger value needs fewer steps, but more products with K in each step."""
 _MOST_DEGREE = 60
 _WIDEST = 0.9
 """The largest lower end of the polynomial's band, as a fraction of its upper end."""
@@ -66,8 +65,7 @@ class FilteredAdjoint(Adjoint[Pencil]):
         mass = space.restrict(nodal.lumped)
         quotients = values / jax.lax.map(lambda phi: jnp.sum(mass * phi * phi), vectors, batch_size=self.block)
         band = Band(jnp.minimum(jnp.max(quotients) * (1 + 1 / values.size), _WIDEST * high), high)
-        # For quotients nearer to the band, the polynomial of the highest degree would be less than `_GAIN`, and the
-        # preconditioner might be indefinite.
+        # Quotients nearer to the band would need degrees above `_MOST_DEGREE`: the preconditioner might be indefinite.
         nearest = (math.cosh(math.acosh(_GAIN) / _MOST_DEGREE) - 1) / 2
         quotients = jnp.minimum(quotients, band.low - nearest * (band.high - band.low))
         clean = complement.without_known(pencil, vectors)

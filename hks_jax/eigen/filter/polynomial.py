@@ -40,22 +40,20 @@ class Band(NamedTuple):
 #     x + q(M⁻¹K) M⁻¹r,    q(z) = (p(z)/p(λ) − 1)/(z − λ),
 #
 # in which M⁻¹ acts only on the residual. So an approximate inverse of M, or single precision, does not change the limit
-# of the iteration (residual-based filtering, R-ChFSI). Let the lumped mass D replace M in the correction. Consider an
-# eigenvector of K and M with eigenvalue μ that D⁻¹M multiplies by a factor β < 1. For this eigenvector, the argument z
-# of the polynomial q becomes βμ, and the coefficient of D⁻¹r is β(μ − λ), although q assumes the coefficient z − λ. The
-# coefficient and the assumed one agree up to second order in h²λ, where h is the node spacing, if the lumped quotient
-# ζ = xᵀKx / xᵀDx replaces λ in q and the correction is multiplied by ζ/λ: for β(μ) ≈ 1 − ch²μ,
+# of the iteration (residual-based filtering, R-ChFSI). Let the lumped mass D replace M. For an eigenvector of
+# eigenvalue μ that D⁻¹M multiplies by β < 1, the argument z of q becomes βμ, and the coefficient of D⁻¹r is β(μ − λ),
+# but q assumes z − λ. Both coefficients agree up to second order in h²λ, where h is the node spacing, if the lumped
+# quotient ζ = xᵀKx / xᵀDx replaces λ in q and the correction is scaled by ζ/λ: for β(μ) ≈ 1 − ch²μ,
 #
 #     z − ζ = (μ − λ)(β − ch²λ + …) = β(μ − λ) · ζ/λ + ….
 #
 #
 # If the mesh is coarse in one direction only, the factor β also depends on the direction of an eigenvector, and the
-# order of the values βμ near the edge of the band may differ from the order of the eigenvalues μ. If the mesh is too
-# coarse for the wanted eigenvectors, unwanted eigenvectors with factors β ≈ 3⁻ᵈ in d dimensions, and with much larger
-# eigenvalues μ, have smaller values βμ than the wanted ones. For such meshes, W = Σⱼ (I − D⁻¹M)ʲ D⁻¹ with j = 0, …, n
-# replaces D⁻¹, which adds n terms of the Neumann series of M⁻¹. With W, the eigenvalue βμ of D⁻¹K becomes the
-# eigenvalue ψ = (1 − (1 − β)ⁿ⁺¹)μ of WK, which is at most n + 1 times as large. Since the derivative dψ/dμ is
-# 1 − (n + 2)(1 − β)ⁿ⁺¹, the factor ζ/λ of the correction becomes 1 − (n + 1)(1 − β)ⁿ⁺¹.
+# values βμ near the edge of the band may have another order than the eigenvalues μ. If the mesh is too coarse for the
+# wanted eigenvectors, others with β ≈ 3⁻ᵈ in d dimensions and much larger μ have smaller values βμ. For such coarse
+# meshes, W = Σⱼ (I − D⁻¹M)ʲ D⁻¹ replaces D⁻¹, which adds n terms of the Neumann series of M⁻¹. With W, the eigenvalue
+# βμ of D⁻¹K becomes the eigenvalue ψ = (1 − (1 − β)ⁿ⁺¹)μ of WK, at most n + 1 times as large. Since the derivative
+# dψ/dμ is 1 − (n + 2)(1 − β)ⁿ⁺¹, the scale ζ/λ of the correction becomes 1 − (n + 1)(1 − β)ⁿ⁺¹.
 #
 # W may replace D⁻¹ everywhere. Since the polynomial q is negative on both sides of ζ, −q(D⁻¹K)D⁻¹ is also a symmetric
 # positive definite preconditioner for K − λM.

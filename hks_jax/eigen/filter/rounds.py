@@ -24,15 +24,15 @@ from hks_jax.linear.loops import for_each
 _GAIN = 40.0
 """The factor by which one round damps unwanted modes. Above this value, the error of the lumped mass would dominate."""
 _SPREAD = 1e5
-"""The largest value of a filter polynomial at 0, if it is at most 1 on the band; beyond this value, rounding
+"""The largest value at 0 of a filter polynomial that is at most 1 on the band; with a larger value, rounding
 dominates."""
 _LEAST_DEGREE = 4
 _MARGIN = 1.1
 """The safety factor of Weyl's law for the eigenvalue of the last vector."""
 _SPLIT, _APART = 0.02, 1.5
-"""The Neumann series of the inverse mass gets further terms until the filtered eigenvalues ψ(λ) satisfy two conditions:
-for eigenvalues λ near the last wanted one, the relative differences between ψ(λ) and λ vary by at most ``_SPLIT``; for
-all λ above twice the last wanted eigenvalue, ψ(λ) is at least ``_APART`` times the last wanted eigenvalue."""
+"""The Neumann series of the inverse mass gets more terms until the relative errors 1 − ψ(λ)/λ of eigenvalues λ near the
+last wanted eigenvalue differ by at most ``_SPLIT``, and until ψ(λ) is at least ``_APART`` times the last wanted
+eigenvalue for all λ above twice that eigenvalue."""
 _MOST_TERMS = 15
 """The maximal number of terms, after the first, of the Neumann series of the inverse mass."""
 
@@ -136,8 +136,7 @@ class GridFilter(eqx.Module):
         """Filter the blocks of vectors that have not converged (all if ``rounding`` is None), then apply Rayleigh–Ritz.
 
         Outside `jit` and on one device, the round can be interrupted between two blocks. After each block, ``done``
-        receives the number of products with K in this round so far and their number in the whole round. `improve` is
-        the compiled version.
+        receives the numbers of products with K in this round, so far and in total. `improve` is the compiled version.
         """
         slabs, plan, layout = self.slabs, self.plan, _layout(self.slabs)
 
@@ -180,8 +179,7 @@ class GridFilter(eqx.Module):
 
     @partial(jax.jit, donate_argnames="vectors")
     def filter_block(self, chosen: Filtering, values: Values, number: Number, own: Number, vectors: OwnRows) -> OwnRows:
-        """Filter a block of vectors that has the index ``number`` among all blocks and ``own`` among this device's
-        blocks."""
+        """Filter the block of vectors with index ``number`` among all blocks and ``own`` among this device's blocks."""
         pencil, block, products = self.pencil, self.plan.block, self.pencil.products()
         band, degree = chosen.band, chosen.degrees[number]
 
@@ -235,6 +233,5 @@ def _lumping(plan: Plan, state: FilterState) -> tuple[Number, Values, Values]:
 
 
 def _layout(slabs: Slabs | None) -> FilterState:
-    """Return the sharding of a state: vectors are divided into slabs; every device has the other arrays."""
     vectors = EVERYWHERE if slabs is None else PartitionSpec(None, slabs.name)
     return FilterState(EVERYWHERE, vectors, EVERYWHERE, EVERYWHERE, EVERYWHERE, EVERYWHERE)  # type: ignore[arg-type]

@@ -1,9 +1,8 @@
 """A subspace of nodal functions, stored as rows on one device or several, and blockwise Rayleigh–Ritz in it.
 
-A filter needs functions on the whole grid, so each device filters a few of the functions. Rayleigh–Ritz needs all
-functions, so each device computes inner products on a slab of the grid. Between rounds, each device stores all
-functions on its slab, (m, nodes of the slab). For the filters, device i of p gets the blocks i, i + p, i + 2p, … of
-rows. This distribution balances the load, because low modes converge first.
+A filter needs a few functions on the whole grid, and Rayleigh–Ritz needs all functions on a part of the grid. Between
+rounds, each device stores all functions on its slab, (m, nodes of the slab). For the filters, device i of p gets the
+blocks i, i + p, i + 2p, … of rows, which balances the load, because low modes converge first.
 
 ``slabs`` is None on a single device, where no communication is needed.
 """

@@ -70,8 +70,8 @@ class ShiftInvert(Eigensolver[Pencil]):
 
         def solve(volume: ArrayLike, *data: ArrayLike) -> tuple[np.ndarray, ...]:
             K, M = matrices(*data)
-            # K + sM is positive definite for any shift s > 0. The shift is less than Weyl's estimate of the lowest
-            # positive eigenvalue or, without a volume, a thousandth of the median of Kᵢᵢ/Mᵢᵢ.
+            # K + sM is positive definite for any shift s > 0. The shift is small relative to the lowest positive
+            # eigenvalue by Weyl's law or, if that is unknown, relative to the median of Kᵢᵢ/Mᵢᵢ.
             if dimension is None or not np.isfinite(volume):
                 shift = 1e-3 * float(np.median(K.diagonal() / M.diagonal()))
             else:
@@ -151,7 +151,6 @@ def expected_solves(done: int, basis: int, wanted: int) -> int:
 
 
 def _padded(values: np.ndarray, vectors: np.ndarray, k: int, complete_below: float) -> HostPairs:
-    """Return the eigenvalues in ascending order and the eigenvectors as rows, padded with NaN to k pairs."""
     order, missing = np.argsort(values), k - values.size
     return (
         np.pad(values[order], (0, missing), constant_values=np.nan),

@@ -65,11 +65,10 @@ def write(basis: Basis, block: Block, row: Int[Array, ""]) -> Basis:
     return tuple(written)
 
 
-# One step of shift-invert Lanczos amplifies a block's component along a converged eigenvector 10 to 100 times. So
-# within two steps, rounding errors in a block x grow to components c = VᵀMx of 1e-14 to 1e-9 along the basis vectors V.
-# The components c are computed in double precision, because the rounding errors of sums in single precision would be as
-# large as c. Single precision suffices to subtract the projection Vc from x, with an error of 6e-8 relative to c. If
-# the components c are large, because the shift is close to an eigenvalue, V is used in double precision.
+# One step of shift-invert Lanczos amplifies a block's component along a converged eigenvector 10 to 100 times. So in
+# two steps, rounding errors in a block x grow to components c = VᵀMx of 1e-14 to 1e-9 along the basis V. The sums for c
+# need double precision, because their rounding errors would otherwise be as large as c. Single precision suffices to
+# subtract the projection Vc from x, unless c is large because the shift is close to an eigenvalue.
 def within(basis: Basis, images: Float[Array, "n_dof c"], filled: Int[Array, ""]) -> Float[Array, "n_dof c"]:
     """Return VVᵀMx, the projection of columns x on the first ``filled`` basis vectors V, given ``images`` = Mx."""
     if not isinstance(basis, tuple):
@@ -118,14 +117,12 @@ def combined(mix: Float[Array, "q m"], basis: Basis) -> Float[Array, "q n_dof"]:
 
 
 def _starts(basis: Basis) -> list[int]:
-    """Return the number of basis vectors before each piece of the basis."""
     return list(accumulate((len(piece.rows) for piece in basis[:-1]), initial=0))
 
 
 def _put(
     rows: Float[Array, "rows n_dof"], block: Float[Array, "b n_dof"], place: Int[Array, ""], inside: Bool[Array, ""]
 ) -> Float[Array, "rows n_dof"]:
-    """Write the block into the rows if ``inside``; otherwise return the rows unchanged."""
     block = block.astype(rows.dtype)
     # A loop of at most one iteration writes only to the block's piece of the basis; a mask would write to every piece.
     return jax.lax.fori_loop(

@@ -34,8 +34,6 @@ class ShiftedSolve(NamedTuple):
 
 
 class _Recurrence(NamedTuple):
-    """The state of the block Lanczos recurrence."""
-
     basis: Basis  # M-orthonormal rows: the known eigenvectors, then the blocks so far; the other rows are zero
     before: Block  # the last block in the basis
     block: Block  # the next block, which is not yet in the basis
@@ -75,7 +73,6 @@ def block_lanczos(
 
 @jit_quickly(static_argnames="room")
 def _begin(pencil: SymmetricPencil, start: Block, known: Known, room: int) -> _Recurrence:
-    """Return the initial state, whose first block is orthogonal to the known vectors."""
     mass, block, b = pencil.mass.of_columns(), start, start.shape[1]
     for _ in range(2 if len(known) else 0):
         block = block - matmul(products_with_columns(known, mass(block)).T, known).T

@@ -152,7 +152,6 @@ def _nearest(
 def _inverse_iteration(
     pencil: SymmetricPencil, shifted: ShiftedSolve, vectors: Stored, known: Int[Array, ""], x: Block
 ) -> tuple[Float[Array, " b"], Block, Float[Array, " b"]]:
-    """Return Ritz values, M-orthonormal Ritz vectors orthogonal to the known vectors, and residuals."""
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
     x = shifted.factor.solve(mass(x))
     for _ in range(2):
@@ -187,7 +186,6 @@ def _window(
 
 @jit_quickly(donate_argnames="known_vectors")
 def _stored(known_vectors: Stored, vectors: Float[Array, "ritz n_dof"], order: Order, known: Int[Array, ""]) -> Stored:
-    """Append ``vectors[order]`` to the known vectors, in place."""
     return jax.lax.dynamic_update_slice_in_dim(known_vectors, vectors[order], known, 0)
 
 
@@ -206,8 +204,7 @@ def _accept(
     values, residuals, _ = measure_pairs(problem.pencil, vectors)
     first_nonzero = jnp.sort(jnp.concatenate([state.values, values]))[plan.nulls]
     scale = jnp.maximum(jnp.abs(values), jnp.maximum(first_nonzero, problem.unit))
-    # If the last search found no pair, as on a very elongated domain, rounding exceeds its usual level, and more is
-    # allowed.
+    # If the last search found no pair, as on a very elongated domain, larger rounding errors are accepted.
     excuse = jnp.where(state.stuck, _EXCUSE, 1).astype(dtype)
     allowed = allowed_residuals(scale, excuse * indistinct(problem.pencil, dtype), plan.tolerance)
     converged = (residuals <= allowed) & (theta != 0)
@@ -233,9 +230,9 @@ def _accept(
     gapless = jnp.max(jnp.where((index < known) & (all_values < end), all_values, -jnp.inf), initial=0)
 
     # If eigenvalues below the shift are missing, move towards the lowest Ritz value that did not converge. If all Ritz
-    # values below the shift converged, copies of an unknown multiple eigenvalue are missing; so move towards
-    # `complete_below`. If not even the lowest pairs converge, move below the spectrum, where K − σM is definite and its
-    # factorisation most accurate.
+    # values below the shift converged, copies of some multiple eigenvalue are missing; move towards `complete_below`.
+    # If not even the lowest pairs converge, move below the spectrum, where K − σM is definite and its factorisation
+    # most accurate.
     lowest = jnp.min(jnp.where(~converged & (values > low) & (values < shift), values, shift))
     seen, stuck = lowest < shift, ~complete & (count == 0)
     again = jnp.where(seen, lowest + (shift - lowest) / 4, (state.complete_below + shift) / 2)
