@@ -35,7 +35,7 @@ def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensol
     """Return the solver with the given name.
 
     ``"auto"`` chooses by the pencil's size, k and dtype. On an accelerator or for traced values (`jax.jit`,
-    `jax.vmap`), it never chooses shift-invert, because shift-invert runs on the host.
+    `jax.vmap`), ``"auto"`` never chooses shift-invert, because shift-invert runs on the host.
 
     Raises:
         ValueError: the name is unknown.
@@ -54,8 +54,8 @@ def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensol
 def choose_for_fit(pencil: AnyPencil, k: int) -> Eigensolver:
     """Return the solver that ``"auto"`` chooses in a fit.
 
-    A fit multiplies many vectors by each Jacobian. The linear solver of block Lanczos reuses its factorisations in all
-    products with one Jacobian. The values of a fit are traced, so the solver must not run on the host.
+    A fit multiplies many vectors by every Jacobian. The linear solver of block Lanczos reuses its factorisations in all
+    products with one Jacobian. Values are traced in a fit, so the solver must not run on the host.
     """
     n, fitting = pencil.space.n_dof, BlockLanczos(adjoint=FactorisedAdjoint(1e-5, solves=20))
     return fitting if n > _SMALL and k + 20 <= fitting.max_pairs(n) else Dense()

@@ -146,7 +146,7 @@ def _numpy_rule(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> A
         into, frame = force @ functions.T, onto(force)
         within = np.where(apart[:, :k], inverse[:, :k] * into, -(moved @ functions.T) / 2)
         return np.diagonal(into), within @ functions + frame, frame
-    # The transpose of the computation above.
+    # Reverse mode is the transpose of the computation above.
     of_values, of_vectors, of_frame = y
     within = of_vectors @ functions.T
     into = np.where(apart[:, :k], inverse[:, :k] * within, 0) + np.diag(of_values)
@@ -250,7 +250,7 @@ def _with_null_modes(xp: Any, mass: Any, nulls: Any, values: Any, vectors: Any) 
     inverse_cholesky: Any
     if xp is jnp:
         product, inverse_cholesky = matmul, lapack.inverse_cholesky
-        nulls = jax.lax.optimization_barrier(nulls)  # so that XLA does not fold these constants
+        nulls = jax.lax.optimization_barrier(nulls)  # keeps XLA from folding these constants
     else:
         product, inverse_cholesky = np.matmul, lambda gram: np.linalg.inv(np.linalg.cholesky(gram))
     nulls = nulls[: values.size]

@@ -78,7 +78,7 @@ def _of_problem(report: Report, number: int, of: int) -> Report:
 
 @partial(jax.jit, static_argnames=("k", "extra"))
 def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: int) -> Eigenpairs:
-    """Merge the parts' pairs and return the k lowest; with ``extra`` = 1 also the next eigenvalue."""
+    """Merge the pairs of all parts, and return the k lowest; with ``extra`` = 1, also return the next eigenvalue."""
     values, sizes = jnp.concatenate([pairs.eigenvalues for pairs in solved]), [pairs.k for pairs in solved]
     order = jnp.argsort(jnp.concatenate(_sorted_by(pencil, solved)))
     lowest, ends = order[:k], np.cumsum(sizes)[:-1]

@@ -57,7 +57,7 @@ def eigenpairs(
             solver's ``adjoint``.
         mass: the mass matrix of a field or mesh, ``"consistent"`` or ``"lumped"``.
         multiplet: the treatment of a multiple eigenvalue that k cuts, so that only some of its pairs are among the k
-            lowest; unused with an interval. ``"report"`` warns. ``"drop"`` excludes these pairs from every signature.
+            lowest; unused with an interval. ``"report"`` warns. ``"drop"`` excludes its pairs from every signature.
             ``"complete"`` computes 8 more pairs and includes the missing pairs, or drops the eigenvalue if 8 pairs are
             too few. ``.kept`` marks the included pairs.
         throw: whether to raise an error if ``.result`` is not successful or derivatives do not converge; under `jit`, a
@@ -147,7 +147,7 @@ def eigsh(
         progress: see `eigenpairs`.
 
     Returns:
-        The pairs with residuals, convergence flags and the certificate. All signatures accept them.
+        The pairs, which all signatures accept, with residuals, convergence flags and the certificate.
 
     Raises:
         ValueError: `sparse_pencil` or `eigenpairs` does not accept an argument.

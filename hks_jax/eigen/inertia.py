@@ -27,7 +27,7 @@ from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.traced import is_traced
 
 _BESIDE = (1e-6, 1e-5, 1e-4, 1e-3)
-"""Relative distances from a shift at which to count if the factorisation at the shift itself is too inaccurate."""
+"""Relative distances from a shift at which eigenvalues are counted if the factorisation at the shift is inaccurate."""
 _TRIES = 60
 """The maximal number of factorisations in a search."""
 _JUST_BELOW = 0.625
@@ -52,8 +52,8 @@ def count_eigenvalues(
     By Sylvester's law of inertia, the number of eigenvalues below σ is the number of negative eigenvalues of K − σM,
     which a factorisation LDLᵀ shows. So one factorisation certifies that a list of eigenvalues is complete. Random
     right-hand sides test whether the error of the factorisation could change its inertia. If σ is an eigenvalue of the
-    domain or of a part of the domain, the factorisation may fail this test. The function then counts the eigenvalues at
-    two numbers just below and above σ, except under `jit`. The function works under `jit`.
+    domain or of a part of the domain, the factorisation may fail this test; outside `jit`, the function then counts the
+    eigenvalues at two numbers just below and above σ. The function works under `jit`.
 
     Args:
         domain: a tensor field, a mesh, a pencil, K, or (K, M), as in `eigenpairs`.
@@ -188,7 +188,7 @@ def _descended(state: _Descent, count: Number, sound: Flag, negative: Number, sp
     near, number = jnp.where(nearer, state.next, state.near), jnp.where(nearer, passed, state.number)
     far = jnp.where(farther, state.next, state.far)
     following = jnp.where(jnp.isfinite(far), (near + far) / 2, 4 * near)
-    # If the number of eigenvalues is uncertain at this distance, the next distance is slightly larger.
+    # If the number of eigenvalues within a distance is uncertain, the next distance is slightly larger.
     following = jnp.where(sound, following, state.next + 1e-2 * (jnp.minimum(far, 2 * state.next) - state.next))
     few, narrow = (2 * number < most) & (number < negative), far - near <= _ALIKE * jnp.maximum(near, spacing)
     tries = state.tries + 1
@@ -223,7 +223,7 @@ def locate(pencil: SymmetricPencil, wanted: int, probes: int) -> tuple[Scalar, S
     def step(state: _Search) -> _Search:
         return _narrowed(state, *count(state.next), size, least, wanted, pencil.size)
 
-    # Outside `jit`, this search calls the same compiled factorisation as the spectrum slicing that follows.
+    # Outside `jit`, the search for the origin calls the same compiled factorisation as spectrum slicing, which follows.
     start = _Search(-infinite, infinite, none, infinite, -least, none, jnp.ones((), bool))
     state = while_loop(lambda state: state.going, step, start)
     known = jnp.isfinite(state.low) & jnp.isfinite(state.high)
@@ -243,7 +243,7 @@ def _narrowed(state: _Search, count: Number, sound: Flag, size: Scalar, least: S
     down, up = jnp.minimum(-size, 4 * state.next), 4 * jnp.maximum(low, 0) + size * wanted / n
     bracketed = jnp.isfinite(low) & jnp.isfinite(high)
     following = jnp.where(bracketed, low + share * (high - low), jnp.where(jnp.isfinite(high), down, up))
-    # If the number of eigenvalues below this shift is uncertain, the next shift is slightly larger.
+    # If the number of eigenvalues below a shift is uncertain, the next shift is slightly larger.
     beside = state.next + 1e-3 * jnp.where(bracketed, high - low, size * wanted / n)
     few, tries = (number <= 2 * wanted) | (high - low <= _NARROW * least), state.tries + 1
     going = ~(bracketed & few) & (tries < _TRIES)

@@ -84,7 +84,7 @@ class Eigensolver(eqx.Module, Generic[P]):
 
 
 class Dense(Eigensolver[SymmetricPencil]):
-    """The dense solver: `eigh` of L⁻¹KL⁻ᵀ, where M = LLᵀ, in O(n³) time and O(n²) memory. It misses no eigenvalue.
+    """The dense solver, which misses no eigenvalue: `eigh` of L⁻¹KL⁻ᵀ, where M = LLᵀ, in O(n³) time and O(n²) memory.
 
     Examples:
         >>> flat = hj.TensorField(field.grid, np.tile(np.eye(2), (9, 9, 1, 1)))

@@ -24,7 +24,7 @@ from hks_jax.linear.pencil import P, SymmetricPencil
 from hks_jax.linear.products import even_size, inner_products, matmul, products_with_columns, row_blocks
 
 Array = Any
-"""An array of NumPy or JAX; all arguments and the result are of the same library."""
+"""An array of NumPy or JAX. All arguments of a function and its result are arrays of the same library."""
 Scalar = Float[Array, ""]
 Values = Float[Array, " p"]
 """The p lowest eigenvalues, in ascending order."""
@@ -39,12 +39,12 @@ Shifts = Float[Array, " groups"]
 SINGULAR = 1e-8
 """The Rayleigh quotient below which K − λᵢM counts as singular, relative to the first eigenvalue on the complement."""
 _LEAST = 100
-"""In units of ε: the least relative tolerance, and the relative norm below which a projected row counts as zero."""
+"""In units of ε: the least relative tolerance, and the relative norm at which a projected right-hand side is zero."""
 _FACTORISATION = 200
 """Twice the cost of a factorisation of K − σM, in units of one conjugate gradient step for one right-hand side."""
 _MOST_GROUPS = 16
 _ROWS = 128
-"""The number of rows projected together; with fewer rows, the eigenvectors are read from memory more often."""
+"""The number of right-hand sides projected at once; with fewer, the eigenvectors are read from memory more often."""
 
 
 class Adjoint(eqx.Module, Generic[P]):
@@ -53,8 +53,8 @@ class Adjoint(eqx.Module, Generic[P]):
     The field ``adjoint`` of each eigensolver has a default; any `Adjoint` that supports the pencil may replace it.
 
     Attributes:
-        tolerance: the wanted error in the energy norm, relative to the largest row. Because of the rounding errors of
-            eigenvectors, the error has a lower bound.
+        tolerance: the wanted error in the energy norm, relative to the largest right-hand side. Rounding errors of the
+            eigenvectors limit the attainable error.
     """
 
     tolerance: eqx.AbstractVar[float]
@@ -70,7 +70,7 @@ class Adjoint(eqx.Module, Generic[P]):
     def solve(self, prepared: Any, pencil: P, values: Values, vectors: Vectors, rhs: Rows) -> Rows:
         """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0, where Q = I − MΦΦᵀ, p ≥ k and p < n_dof.
 
-        ``prepared`` is the result of `prepare`. Rows that did not converge are NaN. The method works under `jit`.
+        ``prepared`` is the result of `prepare`. Solutions that did not converge are NaN. The method works under `jit`.
         """
 
 
@@ -119,7 +119,7 @@ def wanted_errors(before: OfRows, after: OfRows, amplified: OfRows, tolerance: f
         before: the `norms` of the right-hand sides bᵢ.
         after: the `norms` of the projections Qbᵢ.
         amplified: the `amplification` of each row.
-        tolerance: the wanted relative error of the largest row.
+        tolerance: the wanted relative error for the largest right-hand side.
         dtype: the dtype to which eigenvectors and rows were rounded.
     """
     xp, largest = amplified.__array_namespace__(), before.max()
@@ -173,7 +173,7 @@ def middles_of_gaps(values: Values, targets: Shifts, otherwise: Scalar) -> Shift
 
 
 def unsolved(failed: int | str, total: int) -> str:
-    """Return the message that the solves for some rows did not converge."""
+    """Return the message that the linear solves for some eigenpairs did not converge."""
     return (
         f"derivative: the linear solves for {failed} of {total} eigenpairs did not converge, so their derivatives are "
         "NaN. Either k or an end of the interval cuts a cluster of eigenvalues, or the eigenpairs did not converge. "
@@ -187,8 +187,8 @@ def without_known(pencil: SymmetricPencil, vectors: Vectors) -> OfColumns:
     return lambda x: x - matmul(products_with_columns(vectors, mass(x)).T, vectors).T
 
 
-# Arrays as large as the eigenvectors are updated in place. Filling a new array of this size takes as long as a product
-# with it, because the operating system must provide memory.
+# Arrays as large as the eigenvectors are updated in place, because filling a new array of their size takes as long as a
+# product with it: the operating system must provide memory.
 def projected(
     pencil: SymmetricPencil, vectors: Vectors, rhs: Rows, tolerance: float, amplified: OfRows
 ) -> tuple[Rows, OfRows]:
@@ -245,7 +245,7 @@ def solve_in_blocks(
         def solve_block(number: Array, x: Rows) -> Rows:
             start = jnp.asarray(starts)[number]
             b, error, *own = (jax.lax.dynamic_slice_in_dim(each, start, size) for each in (x, wanted, *of_rows))
-            unsolved = start + np.arange(size) >= number * size  # the last block may overlap the previous one
+            unsolved = start + np.arange(size) >= number * size  # the last two blocks may overlap
             solution = solve(b.T, jnp.where(unsolved, error, jnp.inf), *own).T
             return jax.lax.dynamic_update_slice_in_dim(x, jnp.where(unsolved[:, None], solution, b), start, axis=0)
 

@@ -30,7 +30,7 @@ from hks_jax.linear.products import matmul, products_with_columns
 BLOCK = 16
 """The number of right-hand sides that conjugate gradients treat at once."""
 WINDOW = 32
-"""The number of eigenvectors nearest to a shift that every step projects out."""
+"""The number of eigenvectors nearest to a shift that every conjugate gradient step projects out."""
 _GROWTH = 4e7
 """The largest factor by which solves amplify rounding errors along computed eigenvectors; 1e4 to 1e5 is usual."""
 _MEMORY = 5e8
@@ -134,7 +134,7 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
 
     # If rounding leaves a component of the residual along a computed eigenvector φⱼ, each step multiplies this
     # component by (λⱼ − λᵢ)/(λⱼ − σ), which is large mainly for λⱼ near σ. So each step projects out only the
-    # eigenvectors φⱼ with λⱼ nearest to σ. The other φⱼ are projected out at restarts and at the end.
+    # eigenvectors φⱼ with λⱼ nearest to σ. Other computed eigenvectors are projected out at restarts and at the end.
     def _solve_block(
         self, pencil: Any, values: Values, without_near: OfColumns, without_known: OfColumns, *of_block: Any
     ) -> Columns:
@@ -155,9 +155,9 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
 #
 #     A = (K − σM)⁻¹ (K − λᵢM)
 #
-# has the eigenvalues (λⱼ − λᵢ)/(λⱼ − σ) > 0 on the complement. A is symmetric in the inner product xᵀMy, in which
-# conjugate gradients solve A xᵢ = (K − σM)⁻¹ bᵢ for the right-hand side bᵢ. Products with A use the exact K − λᵢM. So
-# an inaccurate factorisation of K − σM slows down convergence, but does not change the solution.
+# has the eigenvalues (λⱼ − λᵢ)/(λⱼ − σ) > 0 on the complement. The matrix A is symmetric in the inner product xᵀMy, in
+# which conjugate gradients solve A xᵢ = (K − σM)⁻¹ bᵢ for the right-hand side bᵢ. Products with A use the exact
+# K − λᵢM. So an inaccurate factorisation of K − σM slows down convergence, but does not change the solution.
 #
 # Define the odds ω(λ) = (Λ₊ − λ)/(λ − Λ₋) of an eigenvalue λ. The condition number of the preconditioned matrix A is at
 # most the ratio of the odds ω(λᵢ) and ω(σ); for example, if λᵢ < σ, the eigenvalues of A lie between (λᵢ − Λ₋)/(σ − Λ₋)

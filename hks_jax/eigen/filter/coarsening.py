@@ -28,8 +28,8 @@ def coarsen(fine: NodalPencil) -> NodalPencil:
     axes = [axis_colours(n, 3, wraps) for n, wraps in zip(shape, fine.periodic, strict=True)]
     counts = [int(axis.max()) + 1 for axis in axes]
     padded = -(-math.prod(counts) // _COLUMNS) * _COLUMNS
-    # Neighbouring nodes have different colours; the colour of a neighbour that does not exist is −1. The barriers keep
-    # XLA from computing constants for all nodes from the colours along single axes, which are constants of the program.
+    # Neighbouring nodes have different colours; the colour of a neighbour that does not exist is −1. Only the colours
+    # along single axes are constants of the program: `optimization_barrier` keeps XLA from computing larger constants.
     colours = jnp.zeros((), jnp.float32)
     along = jax.lax.optimization_barrier([jnp.asarray(axis, jnp.float32) for axis in axes])
     for axis, (own, count) in enumerate(zip(along, counts, strict=True)):

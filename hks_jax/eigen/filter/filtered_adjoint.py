@@ -65,7 +65,8 @@ class FilteredAdjoint(Adjoint[Pencil]):
         mass = space.restrict(nodal.lumped)
         quotients = values / jax.lax.map(lambda phi: jnp.sum(mass * phi * phi), vectors, batch_size=self.block)
         band = Band(jnp.minimum(jnp.max(quotients) * (1 + 1 / values.size), _WIDEST * high), high)
-        # Quotients nearer to the band would need degrees above `_MOST_DEGREE`: the preconditioner might be indefinite.
+        # If a quotient were nearer to the band, the polynomial of degree `_MOST_DEGREE` would not reach `_GAIN`, and
+        # the preconditioner might be indefinite.
         nearest = (math.cosh(math.acosh(_GAIN) / _MOST_DEGREE) - 1) / 2
         quotients = jnp.minimum(quotients, band.low - nearest * (band.high - band.low))
         clean = complement.without_known(pencil, vectors)

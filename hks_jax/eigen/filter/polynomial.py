@@ -40,13 +40,13 @@ class Band(NamedTuple):
 #     x + q(M⁻¹K) M⁻¹r,    q(z) = (p(z)/p(λ) − 1)/(z − λ),
 #
 # in which M⁻¹ acts only on the residual. So an approximate inverse of M, or single precision, does not change the limit
-# of the iteration (residual-based filtering, R-ChFSI). Let the lumped mass D replace M. For an eigenvector of
-# eigenvalue μ that D⁻¹M multiplies by β < 1, the argument z of q becomes βμ, and the coefficient of D⁻¹r is β(μ − λ),
-# but q assumes z − λ. Both coefficients agree up to second order in h²λ, where h is the node spacing, if the lumped
-# quotient ζ = xᵀKx / xᵀDx replaces λ in q and the correction is scaled by ζ/λ: for β(μ) ≈ 1 − ch²μ,
+# of the iteration (residual-based filtering, R-ChFSI). Let the lumped mass D replace M, and let D⁻¹M multiply an
+# eigenvector with eigenvalue μ by β < 1. In the correction with D, the argument z of q becomes βμ, and D⁻¹r contains
+# the eigenvector with the factor β(μ − λ), while q assumes the factor z − λ. Both factors agree up to second order in
+# h²λ, where h is the node spacing, if the lumped quotient ζ = xᵀKx / xᵀDx replaces λ in q and the correction is scaled
+# by ζ/λ: for β(μ) ≈ 1 − ch²μ,
 #
 #     z − ζ = (μ − λ)(β − ch²λ + …) = β(μ − λ) · ζ/λ + ….
-#
 #
 # If the mesh is coarse in one direction only, the factor β also depends on the direction of an eigenvector, and the
 # values βμ near the edge of the band may have another order than the eigenvalues μ. If the mesh is too coarse for the

@@ -22,7 +22,7 @@ from hks_jax.linear.accelerators import row_by_row
 from hks_jax.linear.loops import for_each
 
 _GAIN = 40.0
-"""The factor by which one round damps unwanted modes. Above this value, the error of the lumped mass would dominate."""
+"""The factor by which one round damps unwanted modes. The error of the lumped mass would dominate a larger factor."""
 _SPREAD = 1e5
 """The largest value at 0 of a filter polynomial that is at most 1 on the band; with a larger value, rounding
 dominates."""
@@ -165,7 +165,7 @@ class GridFilter(eqx.Module):
         spare = jnp.arange(plan.size) >= plan.wanted
         terms, filtered_values, factor = _lumping(plan, state)
         high = (1 + terms).astype(self.high.dtype) * self.high
-        # Vectors beyond the wanted ones may be far from eigenvectors. So Weyl's law limits the lower end of the band.
+        # Weyl's law limits the lower end of the band, because the vectors that are not wanted may be inaccurate.
         edge = _MARGIN * filtered_values[plan.wanted - 1] * (plan.size / plan.wanted) ** (2 / len(self.pencil.shape))
         low = jnp.minimum(jnp.minimum(jnp.max(filtered_values), edge), high / 2)
         band = Band(low, high)
@@ -188,7 +188,7 @@ class GridFilter(eqx.Module):
             theta, zeta, scale = (
                 jax.lax.dynamic_slice_in_dim(v, number * block, block) for v in (values, chosen.values, chosen.factor)
             )
-            # If ζ is in the damped band, the residual of x is not small, so the polynomial is applied to x itself.
+            # If the quotient ζ of x is in the damped band, the residual is large, and the polynomial is applied to x.
             inside = zeta > band.low
             image, moved = products(x)
             residual = image - jnp.where(inside, 0, theta * moved)

@@ -38,7 +38,7 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
 
     Attributes:
         tolerance: the relative residual at which a pair counts as converged.
-        block: the number of vectors per Lanczos block. Multiplicities may exceed this number.
+        block: the number of vectors per Lanczos block, which multiplicities of eigenvalues may exceed.
         slice_size: the number of eigenvalues per slice; None means an automatic choice.
 
     Examples:

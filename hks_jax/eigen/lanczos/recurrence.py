@@ -18,7 +18,7 @@ from hks_jax.linear.products import matmul, products_with_columns
 from hks_jax.traced import is_traced
 
 _STRETCH = 16
-"""The number of Lanczos steps per compiled call outside `jit` on a CPU, after which a user can interrupt them."""
+"""The number of Lanczos steps per compiled call outside `jit` on a CPU; a user can interrupt between two calls."""
 
 Known = Float[Array, "w n_dof"]
 RitzPairs = tuple[Float[Array, " ritz"], Float[Array, "ritz n_dof"]]
@@ -47,7 +47,7 @@ def block_lanczos(
     pencil: SymmetricPencil,
     shifted: ShiftedSolve,
     start: Block,  # any vectors, from which the first block is made
-    known: Known,  # M-orthonormal eigenvectors or zero rows; their number w is a multiple (or 0) of the block size b
+    known: Known,  # M-orthonormal eigenvectors or zero rows; their number w is 0 or a multiple of the block size b
     room: int,  # the maximal number of blocks; static
     steps: int | Int[Array, ""],  # the number of blocks to compute, even; under `jit`, `room` blocks are computed
     wanted: int,

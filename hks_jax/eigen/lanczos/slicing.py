@@ -60,7 +60,7 @@ def _consider(
     missing = below - known
     complete = trial.sound & (missing == 0)
     last = jnp.sort(state.values)[plan.wanted - 1]
-    # The search ends if all wanted pairs are known (or all but copies of the last), or if no further pairs exist.
+    # The search ends if all wanted pairs are known, or all but copies of the last one, or if no further pairs exist.
     all_wanted = (known >= plan.wanted) | (last * (1 - 2 * _COPY) < state.shift)
     finished = complete & (all_wanted | (negative == problem.pencil.size))
     # If lowering the shift leaves equally many eigenvalues missing, the missing ones are copies of a multiple
@@ -122,7 +122,7 @@ def search(
         one_multiplet = not is_traced(following.stuck) and bool(following.stuck and state.below > 0)
     if one_multiplet:
         order, new, following = _nearest(problem, shifted, plan, state, vectors)
-    # This is a separate call, so that only two arrays of vectors are in memory at a time.
+    # New vectors are stored in a separate call, so that only two arrays of vectors are in memory at a time.
     return following, _stored(vectors, new, order, state.known)
 
 
