@@ -36,13 +36,13 @@ _ON_HOST = 1 << 22
 def solved(
     solver: Eigensolver, pencil: SymmetricPencil, k: int, extra: int, interior: bool, throw: bool, report: Report
 ) -> tuple[Values, Vectors, Vectors, Scalar, Scalar]:
-    """Return k eigenvalues, their eigenvectors, these vectors as a frame, the next eigenvalue, and a certified bound.
+    """Return k eigenvalues, their eigenvectors, the frame, the next eigenvalue, and a certified bound.
 
     The pairs are the k lowest eigenpairs or, if ``interior``, the first k above the origin of a `LocatedPencil`. The
-    derivative of the frame excludes rotations of the k eigenvectors among themselves. The next eigenvalue is infinite
-    unless ``extra`` = 1. The solver certifies that none of the k eigenvalues is missing below the bound. Derivatives
-    treat the next eigenvalue and the bound as constants. Derivatives whose linear solves do not converge are NaN, and
-    raise an error if ``throw`` is set, or else cause a warning if values are concrete.
+    frame is equal to the eigenvectors, but its derivative excludes rotations of the k eigenvectors among themselves.
+    The next eigenvalue is infinite unless ``extra`` = 1. The solver certifies that none of the k eigenvalues is missing
+    below the bound. Derivatives treat the next eigenvalue and the bound as constants. Derivatives whose linear solves
+    do not converge are NaN, and raise an error if ``throw`` is set, or else cause a warning if values are concrete.
     """
     values, vectors, complete_below = _computed(solver, pencil, k, extra, interior, report)
     values, vectors, following = _cut(values, vectors, k)

@@ -30,7 +30,7 @@ class ShiftedSolve(NamedTuple):
 
     factor: Factorisation  # the factorisation of K − σM
     shift: Float[Array, ""]  # σ
-    passes: Int[Array, ""] | None  # the number of solves per step: 1, or 2 with refinement; None compiles only 1
+    passes: Int[Array, ""] | None  # the number of solves per step: 1, or 2 with refinement; None means always 1
 
 
 class _Recurrence(NamedTuple):
