@@ -161,7 +161,6 @@ def check_metric(metric: Float[np.ndarray, "n d d"], cells: Int[np.ndarray, "n c
 
 
 def _check_once(faces: Int[np.ndarray, "F 3"]) -> None:
-    """Raise ValueError if two triangles have the same vertices, in any order."""
     vertices = np.sort(faces, axis=1)
     order = np.lexsort(vertices.T[::-1])
     again = np.flatnonzero((vertices[order[1:]] == vertices[order[:-1]]).all(axis=1))

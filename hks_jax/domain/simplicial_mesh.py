@@ -71,9 +71,9 @@ class SimplicialMesh(eqx.Module):
         surface D stands for its tangential part. If D is the identity, g is the Euclidean metric.
 
         Tensors at vertices are interpolated to the centre of each cell: by the mean of the tensors at the cell's
-        vertices, or with ``"log-euclidean"`` by the exponential of the mean of their logarithms. Using one tensor per
-        cell causes an error of second order, like the elements. The metric is differentiable with respect to tensors
-        and vertices.
+        vertices, or with ``"log-euclidean"`` by the exponential of the mean of their logarithms. One tensor per cell
+        causes an error of second order, like the elements. The metric is differentiable with respect to tensors and
+        vertices.
 
         Args:
             vertices: positions (V, 3).
@@ -244,7 +244,6 @@ def _edges_of(xp: Any, vertices: Any, cells: Any) -> Any:
 
 @numpy_where_known()
 def _induced_metric(xp: Any, edges: Any) -> Any:
-    """Return the inner products of the edges of each cell."""
     return spd.nan_unless_positive(xp, matmul(edges.mT, edges))
 
 
