@@ -64,8 +64,8 @@ def label_nodes(mask: Bool[np.ndarray, "*shape"], periodic: tuple[bool, ...]) ->
     Returns the labels (0 outside, 1 … n inside) and their number n.
     """
     elements = active_elements(mask, periodic)
-    # Elements that share a node are connected, but two neighbouring nodes need not share an element. So elements are
-    # labelled, and pass their labels to nodes. Labels that meet at periodic sides, which SciPy ignores, are merged.
+    # Elements that share a node are connected, but two neighbouring nodes need not share an element. Therefore elements
+    # are labelled, and nodes take the labels of their elements. Labels that meet at periodic sides are merged.
     labels, count = scipy.ndimage.label(elements, structure=np.ones((3,) * mask.ndim, dtype=bool))
     nodes = element_nodes(labels, periodic)
     if any(periodic) and count > 1:

@@ -28,10 +28,10 @@ class DegeneratePoints(NamedTuple):
 def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
     """Find the points of a 2D field where the two eigenvalues are equal, and the topological index of each.
 
-    Where the eigenvalues of the tensor T are equal, the vector v = (T₁₁ − T₂₂, 2T₁₂) is zero. The vector v is
-    interpolated bilinearly in each grid cell, and turns twice as fast as the eigenvectors. If v makes a full turn along
-    the sides of a cell, the cell has one degenerate point, of index ½ (wedge) or −½ (trisector). Degenerate points that
-    are close together are merged into one point, whose index is the sum of their indices (Tricoche and others 2001).
+    The vector v = (T₁₁ − T₂₂, 2T₁₂) is zero at the degenerate points of a tensor field T, and turns twice as fast as
+    the eigenvectors of T. The components of v are interpolated bilinearly in each grid cell. If v makes a full turn
+    along the sides of a cell, the cell has one degenerate point, of index ½ (wedge) or −½ (trisector). Neighbouring
+    degenerate points are merged into one, whose index is the sum of their indices (Tricoche and others 2001).
 
     The function does not find degenerate points of index 0, two points of opposite index closer than `merge` cells, or
     points on the rim of the domain. If the eigenvalues are equal on a curve or in a region inside the domain, the
@@ -75,7 +75,7 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
     graph = coo_matrix((np.ones(len(near)), near.T), shape=(len(cells),) * 2)
     count, cluster = connected_components(graph, directed=False)
     turns = winding[tuple(cells.T)]
-    # If v is zero on an edge or node, the turns of v around each adjacent cell are arbitrary, but their sum is not.
+    # If the vector v is zero on an edge or node, its turns around each adjacent cell are arbitrary, but not their sum.
     index = np.bincount(cluster, turns, count) / 2
     settled = np.bincount(cluster, on_rim[tuple(cells.T)], count) == 0
     shared = crossed[tuple(cells.T)]
@@ -92,7 +92,7 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
 def _windings(
     v: Float[np.ndarray, "nx ny 2"], tiny: Float[np.ndarray, "nx ny"], active: Bool[np.ndarray, "mx my"]
 ) -> tuple[Int[np.ndarray, "mx my"], Bool[np.ndarray, "mx my"], Bool[np.ndarray, "mx my"]]:
-    """Return the turns of v around each cell; mark cells where v is zero on an edge, or on an edge at the rim."""
+    """Return the turns of the vector v around each cell; mark cells with v = 0 on an edge, or on an edge in the rim."""
     angle = np.arctan2(v[..., 1], v[..., 0])
     zero = np.hypot(v[..., 0], v[..., 1]) <= tiny
     number = np.zeros(active.shape)
@@ -120,7 +120,6 @@ def _windings(
 
 
 def _ends(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values without the last entry along an axis, and the values without the first entry."""
     n = values.shape[axis]
     return values.take(range(n - 1), axis), values.take(range(1, n), axis)
 

@@ -41,7 +41,7 @@ def _kuhn(n: int, dimension: int) -> tuple[Int[np.ndarray, "p corners"], Int[np.
 def _glued(
     simplices: Int[np.ndarray, "s corners"], n: int
 ) -> tuple[Int[np.ndarray, "V 13"], Int[np.ndarray, "cells corners"]]:
-    """Subdivide simplices of the icosahedron's 12 vertices and its centre; merge the points on common facets."""
+    """Subdivide simplices between the icosahedron's 12 vertices and centre; merge the points on common facets."""
     weights, cells = _kuhn(n, simplices.shape[1] - 1)
     shares = np.zeros((len(simplices), len(weights), _CENTRE + 1), np.int16)
     for i, simplex in enumerate(simplices):

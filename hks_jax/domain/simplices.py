@@ -126,7 +126,7 @@ def check_places(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulatio
             edge = triangulation.facet_vertices(crowded[:1])[0].tolist()
             warn_of_accuracy(
                 f"faces: {crowded.size} edges belong to three triangles or more (the first has the vertices {edge}): "
-                "heat flows into all branches of the surface at these edges. To avoid this, remove the extra triangles"
+                "heat flows into all branches of the surface there. To avoid this, keep at most two triangles per edge"
             )
         _warn_of_hanging(vertices, triangulation)
         return
@@ -173,7 +173,7 @@ def _check_once(faces: Int[np.ndarray, "F 3"]) -> None:
 
 
 def _warn_of_hanging(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulation) -> None:
-    """Warn if a vertex lies between the ends of a boundary edge, where the triangles on both sides do not connect."""
+    """Warn if a vertex lies between the ends of a boundary edge, so that the triangles on both sides do not connect."""
     edges = triangulation.facet_vertices(triangulation.boundary_facets)
     rim = np.unique(edges)
     if not rim.size:

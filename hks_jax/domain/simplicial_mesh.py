@@ -68,12 +68,11 @@ class SimplicialMesh(eqx.Module):
         The tangential part of D is its quadratic form on the plane of a triangle. If D is a diffusion tensor, its
         tangential part describes diffusion within the surface. The choice of the metric g has no default (see
         `TensorField.from_diffusion`): ``"tensor"``, g = D; ``"inverse"``, g = D⁻¹; ``"adjugate"``, g = |D| D⁻¹. On a
-        surface D stands for its tangential part. If D is the identity, g is the Euclidean metric.
+        surface, D in these formulas is the tangential part. If D is the identity, g is the Euclidean metric.
 
-        Tensors at vertices are interpolated to the centre of each cell: by the mean of the tensors at the cell's
-        vertices, or with ``"log-euclidean"`` by the exponential of the mean of their logarithms. One tensor per cell
-        causes an error of second order, like the elements. The metric is differentiable with respect to tensors and
-        vertices.
+        Tensors at vertices are interpolated to the centre of each cell: by the mean of the tensors at its vertices, or
+        with ``"log-euclidean"`` by the exponential of the mean of their logarithms. Using one tensor per cell causes an
+        error of second order, as the elements do. The metric is differentiable with respect to tensors and vertices.
 
         Args:
             vertices: positions (V, 3).
@@ -201,8 +200,8 @@ class TetMesh(SimplicialMesh):
         """Return the surface of the triangles that belong to only one tetrahedron, with the metric induced by space.
 
         Returns:
-            The surface, oriented outward, and the indices (B,) of its vertices in this mesh. With these indices
-            ``numbers``, values (…, V) on this mesh are ``values[..., numbers]`` on the surface.
+            The surface, oriented outward, and the indices (B,) of its vertices in this mesh. If ``numbers`` are the
+            indices, an array ``values`` (…, V) on this mesh is ``values[..., numbers]`` on the surface.
         """
         triangulation = self.triangulation
         numbers, faces = np.unique(triangulation.facet_vertices(triangulation.boundary_facets), return_inverse=True)

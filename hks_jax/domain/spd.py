@@ -111,8 +111,8 @@ positive_or_nan = numpy_where_known()(nan_unless_positive)
 # Let S be a matrix of trace zero. By the Cayley–Hamilton theorem S² = qI with a number q (d = 2), or S³ = pS + |S| I
 # with a number p (d = 3). So exp S is a polynomial in S of degree d − 1, whose coefficients are entire functions of q,
 # or of p and |S|. No eigenvalues are needed, and derivatives of any order are smooth where eigenvalues coincide.
-# Taylor's series gives the coefficients of the matrix E = exp(S/2ⁿ) − I. Replacing E by 2E + E² doubles its exponent,
-# and keeps the relative accuracy of E; n replacements give exp S − I.
+# Taylor's series gives the coefficients of the matrix E = exp(S/2ⁿ) − I. Replacing the matrix E by 2E + E² doubles its
+# exponent, and keeps the relative accuracy of E; n replacements give exp S − I.
 _SQUARINGS, _TERMS = 8, 20
 
 
@@ -182,7 +182,7 @@ def _log_in_2d(tensors: Float[Array, "... 2 2"]) -> Float[Array, "... 2 2"]:
     for n in range(12, -1, -1):
         series = series * jnp.where(small, square, 0) + 1 / (2 * n + 1)
     root = jnp.sqrt(jnp.where(small, 0.04, square))
-    # For x = √q/m, atanh x is log(1 + x) − ½ log(1 − x²), where 1 − x² is the determinant of T/m, even if it is tiny.
+    # For x = √q/m, atanh x is log(1 + x) − ½ log(1 − x²), where |T/m| = 1 − x² is accurate near zero, too.
     factor = jnp.where(small, series, (jnp.log1p(root) - half) / root)
     return (jnp.log(mean) + half)[..., None, None] * eye + factor[..., None, None] * deviator
 

@@ -40,8 +40,8 @@ class TensorField(eqx.Module):
             (i, j). Units: (length / coordinate unit)². Values outside the mask are ignored.
         interpolation: the interpolation between the nodes. With ``"linear"`` the components are multilinear, as in
             Zobel, Reininghaus and Hotz; if the eigenvectors turn, the determinant is larger between the nodes. With
-            ``"log-euclidean"`` the components of log T are multilinear (Arsigny, Fillard, Pennec and Ayache). The
-            logarithm of the determinant is multilinear, too, and T⁻¹ is interpolated in the same way as T.
+            ``"log-euclidean"`` the components of log T are multilinear (Arsigny, Fillard, Pennec and Ayache), as is the
+            logarithm of the determinant, and T⁻¹ is interpolated in the same way as T.
 
     Raises:
         ValueError: a wrong shape; tensors that are NaN, infinite, unsymmetric or not positive definite inside the mask
@@ -170,14 +170,14 @@ class TensorField(eqx.Module):
     ) -> "TensorField":
         """Return a metric made of symmetric tensors S (*shape, d, d) with eigenvalues of either sign, such as stress.
 
-        Indefinite tensors define no metric. Two maps from S to a metric g are available, and neither is the default.
-        Both maps keep the eigenvectors and the order of the eigenvalues of S (Hotz and others 2004):
+        Indefinite tensors define no metric. Two maps from S to a metric g are available, which keep the eigenvectors
+        and the order of the eigenvalues of S (Hotz and others 2004); neither is the default:
 
         - ``"exp"``: g = exp(S/s), where `number` is the scale s > 0 in the units of S. An eigenvalue σ of S becomes
           exp(σ/s). Choose a scale near the largest absolute value of the eigenvalues.
         - ``"shift"``: g = S + c·I, where `number` is the shift c, larger than minus the least eigenvalue of S. The
-          signature depends less on S if the shift is larger. With a shift close to the lower limit, lengths along the
-          strongest compression are almost zero.
+          larger the shift, the less the signature depends on S. With a shift just above its lower limit, lengths along
+          the strongest compression are almost zero.
 
         docs/strain.md describes the signatures of the metrics exp(S/s) and S + c·I.
 
@@ -227,7 +227,7 @@ def _metric_of_diffusion(xp: Any, D: Any, metric: MetricChoice) -> Any:
 
 def _evaluate(function: jtu.Partial, grid: Grid) -> Float[Array, "*shape_and_components"]:
     # Outside the mask the user's function may be singular, and 0·NaN would make the derivatives with respect to its
-    # parameters NaN. So a node inside the mask replaces the nodes outside.
+    # parameters NaN. So it is evaluated at a node inside the mask, in place of each node outside.
     inside = grid.inside
     nodes = jax_array(np.where(inside[..., None], grid.nodes, grid.nodes[inside][0]).reshape(-1, grid.dimension))
     flat = jax.vmap(lambda x: real_array("fn", function(x)))(nodes).astype(nodes.dtype)

@@ -49,7 +49,7 @@ class Triangulation(ByKey):
 
     @cached_property
     def _grouped_facets(self) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-        """Facet numbers, sorted by the facets' vertices; which ones begin a new facet; the parity of their vertices."""
+        """Facet numbers, sorted by vertices; whether each begins a new facet; whether its vertices are in odd order."""
         vertices = self.facet_vertices(np.arange(self.cells.size))
         odd = np.zeros(len(vertices), dtype=bool)
         for a, b in combinations(range(self.dimension), 2):

@@ -122,8 +122,8 @@ def varadhan_distance(
 
     See Varadhan 1967 and Zobel, Reininghaus and Hotz, section 2. At a time t > 0 the kernel in n dimensions is
     (4πt)^(−n/2) exp(−d²/4t) (u₀ + O(t)), where the function u₀ is 1 on a flat domain away from its boundary. Division
-    by the diagonal, k_t(x_s, x)/√(k_t(x_s, x_s) k_t(x, x)), removes the power of t. The result −4t log k_t has the
-    error −4t log u₀ + O(t²) relative to d², and without this normalisation also the error 2nt log 4πt.
+    by the diagonal, k_t(x_s, x)/√(k_t(x_s, x_s) k_t(x, x)), removes the power of t. The normalised kernel estimates d²
+    with the error −4t log u₀ + O(t²). The kernel without normalisation adds 2nt log 4πt to this error of d².
 
     Small times need fine grids and many pairs: with linear elements of node spacing h, d² has the relative error
     h²d²/48t², and exp(−d²/4t) must exceed the truncation and rounding errors. The result is NaN where the estimated
@@ -187,8 +187,8 @@ def _broadcast(values: Any, space: FunctionSpace) -> Any:
 # On an axis with the node spacing h, linear elements give a wave of frequency ξ the eigenvalue λ = ξ² (1 + ξ²h²/12) and
 # the mass m = 1 − ξ²h²/6. In the kernel ∫ exp(iξd − tλ)/m dξ at the distance d, the means of powers of ξ are ⟨ξ²⟩ = (2t
 # − d²)/4t² and ⟨ξ⁴⟩ = (d⁴ − 12td² + 12t²)/16t⁴. To first order in h² the error of the squared distance is d²h² (d² −
-# 4t)/48t², or −d²h² (d² − 12t)/48t² with a lumped mass. The error matters where d² is several times t, and where the
-# relative error is about d²h²/48t². With d² = 4t log(1/k) for the normalised kernel k, this is (h²/12t) log(1/k).
+# 4t)/48t², or −d²h² (d² − 12t)/48t² with a lumped mass. The error matters where d² is several times t. There its ratio
+# to d² is about d²h²/48t², or (h²/12t) log(1/k) with d² = 4t log(1/k) for the normalised kernel k.
 def _least_kernels(
     pairs: Eigenpairs, times: Float[Array, " m"], nodes: Int[np.ndarray, " s"]
 ) -> tuple[Float[Array, "m 1 *ones"], Float[Array, "m s *shape"]]:

@@ -140,7 +140,7 @@ def mixing(
         of_f = jnp.where(kept[:, None] & kept[None], one.divided_difference(low, high), quotient)
         # Between null vectors ``of_f`` has no effect if no perturbation acts on them, and f' may not exist at zero.
         of_f = jnp.where((high == 0) & (fixed | ~jnp.isfinite(of_f)), 0, of_f)
-        # The terms of the equal sum f(low) + high · ``of_f`` would cancel, because f usually decreases.
+        # The sum f(low) + high · ``of_f`` has the same value, but its terms cancel, because f usually decreases.
         of_lambda_f = jnp.where(gap >= 0, f[:, None], f[None]) + low * of_f
         size = jnp.maximum(jnp.abs(f), jnp.abs(values * jnp.diagonal(of_f)))
         # Let pairs i and j both be negligible. Their divided difference is at most f' at one of them if f is monotone,

@@ -44,7 +44,8 @@ class AutomaticHKS(eqx.Module):
         spectral: (n_times,) bool, whether the signature at a time was computed from eigenpairs.
         tail: (n_times,) the estimated share of the signature that the eigenpairs lack, which decides the method.
         method: the spectrum-free method, ``"colouring"`` or ``"selected-inversion"``; ``"none"`` if it was not used.
-        overlap_time: the shortest time from eigenpairs, where the two methods were compared; NaN without comparison.
+        overlap_time: the shortest time from eigenpairs, at which both methods were compared; NaN if they were not.
+        overlap_difference: the greatest difference of the methods at `overlap_time`, relative to (4πt)^(−d/2), or NaN.
         overlap_difference: the greatest difference between the two methods at `overlap_time`, relative to
             (4πt)^(−d/2); NaN without comparison.
     """
@@ -130,10 +131,10 @@ def hks_auto(
 ) -> AutomaticHKS:
     """Compute the heat kernel signature with the suitable method at each time, and report the choice.
 
-    At times at which the pairs lack at most the share `tolerance` of the signature, by the estimate of `truncation`,
-    the signature is computed from the pairs. At the other times `hks_spectrum_free` computes it. If both methods are
-    used, they are compared at the shortest time computed from the pairs, unless this takes more than ten times the work
-    of `hks_spectrum_free` at the other times.
+    The signature is computed from the pairs at times at which they lack at most the share `tolerance` of it (by the
+    estimate of `truncation`), and by `hks_spectrum_free` at the other times. If both methods are used, they are
+    compared at the shortest time computed from the pairs, unless the comparison takes more than ten times the work of
+    `hks_spectrum_free` at the other times.
 
     Args:
         times: (n_times,) positive; the normalisation is as in `hks`.
@@ -243,8 +244,8 @@ def boundary_influence(
     rim of a mask. The share is 1 on the boundary, 0 where the boundary has no effect yet at the time t, and NaN outside
     the mask. At a distance d from a straight side of a flat domain the share is exp(−d²/t).
 
-    The result is differentiable with respect to the tensors. The eigenpairs of a Neumann and a Dirichlet problem are
-    computed. Together they are the eigenpairs with the boundary ``"mean"``, whose signature is (k_N + k_D)/2.
+    The result is differentiable with respect to the tensors. The eigenpairs of a Neumann and of a Dirichlet problem are
+    computed, which together are the eigenpairs with the boundary ``"mean"`` and the signature (k_N + k_D)/2.
 
     Args:
         domain: a metric in 2D or 3D, a mesh, or eigenpairs that were computed with the boundary ``"mean"``.

@@ -59,14 +59,15 @@ def scale_invariant_hks(
     """Compute the scale-invariant HKS (Bronstein and Kokkinos 2010): |FFT(d/dτ log HKS(exp τ, x))| at low frequencies.
 
     The variable τ is the logarithm of the time. Scaling all lengths by β shifts log HKS by log β² along τ, and
-    subtracts a constant from it. The derivative d/dτ removes this constant, and the modulus of the Fourier transform
-    does not depend on the shift. The default times scale with the spectrum, so invariance is exact. The moduli are
-    dimensionless, and NaN outside the mask and at Dirichlet nodes.
+    subtracts a constant, which the derivative d/dτ removes. The modulus of the Fourier transform does not depend on
+    shifts along τ. The default times scale with the spectrum, so invariance is exact. The moduli are dimensionless, and
+    NaN outside the mask and at Dirichlet nodes.
 
     Args:
         n_frequencies: the number of Fourier moduli, from frequency 0.
-        n_times: the number of default times.
-        times: (n,) log-spaced times, to compare domains of known size; by default from 4 ln10/λ_last to 4 ln10/λ₁.
+        n_times: the number of times, if `times` is not given.
+        times: (n,) log-spaced times; give all domains the same times to compare them at absolute scales. The default
+            runs from 4 ln10/λ_last to 4 ln10/λ₁.
 
     Examples:
         >>> nine = hj.eigenpairs(hj.TensorField(field.grid, 9 * field.tensors), k=12)
@@ -119,7 +120,7 @@ def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Arr
     if sigma.ndim != 0:
         raise ValueError(f"sigma: got shape {sigma.shape}; expected one positive width in log λ")
     require_number("sigma", sigma)
-    # Both sums are divided by their largest exponential, to prevent underflow where an energy is far from all log λᵢ.
+    # Dividing the numerator and the denominator by the largest exponential prevents underflow far from all log λᵢ.
     offset = _largest_exponents(*jax.lax.stop_gradient((energies, sigma, pairs.eigenvalues, pairs.kept)))
     bells = Wave(energies, jnp.broadcast_to(sigma, energies.shape), offset)
     return spectral_diagonal(pairs, bells, 1 / spectral_trace(pairs, bells))

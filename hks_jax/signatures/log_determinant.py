@@ -18,7 +18,7 @@ from hks_jax.signatures.truncation import truncation
 from hks_jax.traced import is_traced
 
 _FIRST = 18.0
-"""The least product of the last eigenvalue and the time T. Each eigenvalue λ beyond it contributes E₁(λT) < 1e-9."""
+"""The least product of the last eigenvalue and the time T. Each further eigenvalue λ contributes E₁(λT) < 1e-9."""
 _TIMES, _PER_DOUBLING = 12, 2
 """The number of times T that are tried, and the number of steps from a time T to the time 2T."""
 _DOUBTFUL = 0.01
@@ -33,8 +33,8 @@ class LogDeterminant(NamedTuple):
     Attributes:
         value: log det′ Δ.
         error: an estimate of the discretisation error and of omitted terms of the heat trace; constant in derivatives.
-        time: the time T. Before T, the heat trace is computed from its coefficients; after T, from eigenvalues. T is
-            constant in derivatives.
+        time: the time T, up to which the heat trace is computed from its coefficients, and beyond which from
+            eigenvalues; constant in derivatives.
     """
 
     value: Float[Array, ""]
@@ -104,7 +104,7 @@ def log_determinant(
 
     Args:
         pairs: the lowest eigenpairs, from `eigenpairs`.
-        coefficients: at least a₀, …, a_d of Σ exp(−λᵢt) ~ Σⱼ aⱼ t^((j−d)/2), such as those of `heat_coefficients`.
+        coefficients: at least a₀, …, a_d of the heat trace ~ Σⱼ aⱼ t^((j−d)/2), as from `heat_coefficients` for d = 2.
         extrapolate: the next powers of t in the expansion, with unknown coefficients: (1, 2) on a closed curved
             surface, (0.5, 1) with a curved boundary, none on flat tori and polygons.
         time: T, in (metric length)²; by default the time with the least estimated error.
@@ -137,7 +137,7 @@ def log_determinant(
     _, last = jax.lax.stop_gradient(positive_range(pairs))
     steps = 2.0 ** (np.arange(_TIMES) / _PER_DOUBLING)
     times = _FIRST / last * jnp.asarray(steps, dtype) if time is None else jnp.asarray(time, dtype)[None]
-    # For each of m times T, values are computed at T, √2T, 2T, …; the starts T, √2T and 2T give an error estimate.
+    # For each of m times T, values are computed at T, √2T, 2T, …. Extrapolations from T, √2T, 2T differ by the error.
     count = powers.size + 1
     doublings = 2.0 ** (np.arange(2 * count + 1) / 2)
     values = _at(pairs, a, d, times[:, None] * jnp.asarray(doublings, dtype)[None])

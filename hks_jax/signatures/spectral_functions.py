@@ -26,7 +26,7 @@ from hks_jax.traced import is_traced
 _ROWS = 128
 """The number of eigenvectors whose products with all others are computed at once, which limits the memory."""
 _SIZES = 8
-"""The number of allowed sizes for the eigenpairs of one even or odd problem of a doubled domain; each is compiled."""
+"""The number of sizes for the eigenpairs of an even or odd problem of a doubled domain; each size is compiled."""
 _FILTERS = 8
 """The number of filters whose matrices (k, k) are computed and applied to the eigenvectors at once."""
 
@@ -34,7 +34,7 @@ _FILTERS = 8
 def spectral_diagonal(
     pairs: Eigenpairs, filters: Filter, scale: Float[Array, " m"] | None = None
 ) -> Float[Array, "m *shape"]:
-    """Return Σᵢ f(λᵢ) φᵢ(x)² for each of m filters f, multiplied by one entry of ``scale``; NaN outside the mask."""
+    """Return Σᵢ f(λᵢ) φᵢ(x)² for each of m filters f, times the filter's entry of ``scale``; NaN outside the mask."""
     everywhere = pairs.on(on_all_nodes(pairs.pencil))
     diagonal = _kernel(Diagonal(), filters, everywhere)
     # NaN is inserted after the multiplication, because 0·NaN would make the derivative with respect to ``scale`` NaN.
@@ -99,7 +99,7 @@ def _weighted(contraction: Contraction, weights: Float[Array, "m k"], vectors: F
 #
 # The matrix F does not depend on the basis chosen for a multiple eigenvalue, and is finite. If only some pairs are
 # kept, f is set to zero on all others, and the entries of F between kept pairs do not change. The entries of F between
-# a kept pair i and all other pairs j are f(λᵢ) (Gᵢⱼ − λᵢHᵢⱼ)/(λᵢ − λⱼ). In the differential they add up to
+# a kept pair i and all other pairs j are f(λᵢ) (Gᵢⱼ − λᵢHᵢⱼ)/(λᵢ − λⱼ). These entries add to the differential the sum
 #
 #     Σᵢ f(λᵢ) (φᵢxᵢᵀ + xᵢφᵢᵀ),    xᵢ = (I − ΦΦᵀM) dφᵢ,
 #
@@ -142,7 +142,7 @@ def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 
 def _rows_of(pairs: Eigenpairs, number: int) -> tuple[Int[Array, " m"], Bool[Array, " m"]] | None:
-    """Return the rows of eigenpairs, among them all pairs of one part, and whether each row belongs to this part.
+    """Return numbers of rows that include the pairs of one part, and whether each row belongs to this part.
 
     Parts are the even and odd problems of a doubled domain; the result is None if no domain is doubled. The number of
     rows is rounded up to one of `_SIZES` sizes.

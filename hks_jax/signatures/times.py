@@ -86,9 +86,9 @@ def _n_positive(pairs: Eigenpairs) -> int:
 def default_times(pairs: Eigenpairs, n: int = 16, decay: float = 1e-4) -> Float[Array, " n"]:
     """Return n times, log-spaced from 4 ln10/λ_last to 4 ln10/λ₁ (Sun, Ovsjanikov and Guibas 2009, section 5).
 
-    At the first time the mode of λ_last has decayed to the fraction 1e-4. At the last time, which is not before the
-    first, all modes except the constant have decayed to at most the fraction `decay`. With the decay 0.085 of the
-    command line, √t at the last time is half the length of an interval that has the same first eigenvalue λ₁.
+    At the first of the n times the mode of λ_last has decayed to the fraction 1e-4. At the last of the n times, which
+    is not before the first, all modes except the constant have decayed to at most the fraction `decay`. With the decay
+    0.085 of the command line, √t at the last time is half the length of an interval with the same first eigenvalue λ₁.
 
     Examples:
         >>> times = hj.default_times(pairs, 3)

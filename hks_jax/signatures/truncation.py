@@ -39,8 +39,8 @@ class Truncation(eqx.Module):
         lasting_bias: (n,) the part of `resolution_bias` that does not decrease with t: the error where eigenvectors or
             eigenvalues of the tensors vary between nodes.
         coarse_fraction: (n,) the fraction of nodes where the discretisation error exceeds 10 %.
-        smallest_time: the least time at which `tail` is at most 1 %. At this time up to 6 % of the signature is missing
-            at the worst node, or up to 20 % beside a Dirichlet side.
+        smallest_time: the least time at which `tail` is at most 1 %, and at which the worst node lacks up to 6 % of its
+            signature, or up to 20 % beside a Dirichlet side.
         order: the part of the discretisation error that decreases with t is proportional to t^(−order).
     """
 
@@ -100,15 +100,15 @@ def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]
     By Weyl's law, k (λ/Λ)^(d/2) eigenvalues are below λ, where Λ is the first eigenvalue beyond the k pairs. The law
     gives the share of the heat trace from eigenvalues above Λ; `truncation_map` estimates this share at each node.
 
-    The discretisation error has a part that decreases with t and a part that does not. For node spacing h the
-    decreasing part is d h²/48t for a constant metric that is diagonal in the grid's axes, and larger for other metrics.
-    The lasting part arises where the tensors vary between nodes: the elements overestimate eigenvalues, and
-    interpolation changes the volume. On fields of varying tensors with enough pairs, the measured median error was 1/3
-    to 3 times the estimate; for eigenvalue ratios of 30 on coarse grids it was 1/4 of the estimate. On meshes only the
-    decreasing part is estimated.
+    The discretisation error has a part that decreases with t and a part that does not. For node spacing h, the
+    decreasing part of the error is d h²/48t if the metric is constant and diagonal in the grid's axes, and larger
+    otherwise. The lasting part of the error arises where the tensors vary between nodes: the elements overestimate
+    eigenvalues, and interpolation changes the volume. On fields of varying tensors with enough pairs, the measured
+    median error was 1/3 to 3 times the estimate; for eigenvalue ratios of 30 on coarse grids it was 1/4 of the
+    estimate. On meshes only the decreasing part of the error is estimated.
 
     With a potential or an unknown null space, an exponent that follows from the mean of the eigenvalues replaces d/2 in
-    Weyl's law, if it is larger. The discretisation error is NaN in this case, and for matrices of unknown node spacing.
+    Weyl's law, if it is larger, and the discretisation error is NaN. The error is also NaN for unknown node spacing.
 
     Raises:
         ValueError: if times are not positive and finite, pairs lie in an interval, or the dimension is not known.
@@ -168,11 +168,11 @@ def _truncation(
     return tail, median_of_shares(xp, bias, free), median_of_shares(xp, lasting, free), coarse, smallest
 
 
-# If all eigenvalues grow by the factor 1 + δ, the heat trace Z(t) becomes Z((1 + δ)t). Its relative change is
+# If all eigenvalues grow by the factor 1 + δ, the heat trace Z(t) becomes Z((1 + δ)t). The relative change of Z is
 # proportional to δ and to the slope s = −(2/d) d log Z/d log t, which is 1 at small t and 0 at times at which only the
 # constant function contributes. If the volume grows by the factor 1 + v, the metric grows by the factor (1 + v)^(2/d).
 # The signature is divided by 1 + v and the eigenvalues by (1 + v)^(2/d), with a relative error of size v(1 − s). The
-# truncated part of the heat trace has the slope 1.
+# truncated part of the heat trace has the slope s = 1.
 def _resolution_bias(
     xp: Any, errors: tuple[Any, Any, Any], free: Any, times: Any, slope: Any, order: int
 ) -> tuple[Any, Any]:
@@ -255,8 +255,7 @@ def beyond(count: Float[Array, "..."], exponent: Float[Array, "..."], x: Float[A
     return count * exponent / x * jnp.exp(-x) * integral
 
 
-# For the exponent a = 1 the integral over u in `beyond` is 1. For a = 3/2 integration by parts gives the value
-# 1 + (√π/2) erfc(√x) e^x/√x.
+# The integral over u in `beyond` is 1 for a = 1 and, by parts, 1 + (√π/2) erfc(√x) e^x/√x for a = 3/2.
 def beyond_by_weyl(xp: Any, count: Any, dimension: int, x: Any) -> Any:
     """Return `beyond` for Weyl's exponent d/2, where d is 2 or 3."""
     if dimension == 2:
@@ -284,9 +283,9 @@ def truncation_map(
     `truncation` estimates the mean of this share over the domain. The share can be several times the mean at single
     nodes: beside a Dirichlet side, in its corners, or where tensors vary between nodes. Weyl's law is applied to each
     node x: the sum N(λ, x) of φᵢ(x)² over the eigenvalues below λ is approximated by N(Λ, x) (λ/Λ)^a, where Λ is the
-    first eigenvalue beyond the k pairs. The pairs determine N(Λ, x). They also determine the exponent a of the node,
-    because the mean of the eigenvalues with the weights φᵢ(x)² is Λ a/(a + 1). The exponent is about d/2 inside the
-    domain and at Neumann sides, and d/2 + 1 at a Dirichlet side.
+    first eigenvalue beyond the k pairs. The pairs determine N(Λ, x) and the exponent a at each node, because the mean
+    of the eigenvalues with the weights φᵢ(x)² is Λ a/(a + 1). The exponent a is about d/2 inside the domain and at
+    Neumann sides, and d/2 + 1 at a Dirichlet side.
 
     The result is an estimate, not a bound. On small grids, the largest true share over the nodes was 0.25 to 2 times
     the largest estimate if the mean share exceeded 0.1 %, and up to 3 times if the mean share was 1e-6. The result is

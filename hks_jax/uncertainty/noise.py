@@ -35,7 +35,7 @@ class TensorNoise(eqx.Module):
         correlation: the correlation length w of the noise in coordinate units. The noise is white noise, smoothed by a
             Gaussian with the standard deviation w, and scaled to the covariance. The noise of two nodes at a distance r
             has the correlation exp(−r²/4w²). If w is 0, the noise is independent between nodes.
-        modes: (*shape, n, m), n fields; the noise is their sum with random factors (see `from_modes`). Or None.
+        modes: (*shape, n, m), the n fields whose sum with random factors is the noise (see `from_modes`), or None.
         freedom: the degrees of freedom of the covariance if it was estimated; infinite if it was given.
 
     Raises:
@@ -75,8 +75,8 @@ class TensorNoise(eqx.Module):
 
         For a scan, the field mᵢ is the change of the tensors that the residuals of image i cause
         (`hks_jax.io.TensorVolume.modes`). Multiplying the residuals of each image by one random number zᵢ is called a
-        wild bootstrap. This noise is correlated between voxels like the residuals. The causes of correlation are the
-        image reconstruction, drift of the scanner, motion between images, and diffusion that no tensor describes.
+        wild bootstrap. The noise Σᵢ zᵢ mᵢ is correlated between voxels like the residuals, because of the image
+        reconstruction, drift of the scanner, motion between images, and diffusion that no tensor describes.
 
         Args:
             modes: (*shape, n, m), the m components of the n fields, along the axes of the tensors and in their unit.
@@ -140,7 +140,7 @@ class TensorNoise(eqx.Module):
         relative = np.einsum("na,nb->ab", parts[inside], parts[inside]) / (2 * inside.sum())
         if not np.trace(relative) > 0:
             raise ValueError("first, second: got equal tensors; expected different noise. Pass a second scan")
-        # The squared differences q are scaled to the median of χ², because a few nodes, as in fluid, are much noisier.
+        # The covariance is scaled so that the median of q is the median of χ²: a few nodes, as in fluid, are noisier.
         q = np.einsum("na,ab,nb->n", parts[inside], np.linalg.pinv(2 * relative), parts[inside])
         relative *= np.median(q) / (2 * scipy.special.gammaincinv(len(relative) / 2, 0.5))
         # White noise, smoothed with the width w, has the correlation exp(−h²/4w²) at the distance h.
@@ -156,10 +156,10 @@ class TensorNoise(eqx.Module):
     def from_roughness(cls, tensors: Any, grid: Grid) -> "TensorNoise":
         """Estimate the level of noise from second differences of the tensors.
 
-        In a smooth field, the tensor at a node minus the mean of its two neighbours along an axis is only noise. Its
-        standard deviation is √1.5 times that of the noise at one node, and its median over all nodes and axes depends
-        little on the few nodes at edges of the anatomy. The noise must be independent between nodes. The estimate is
-        too small after smoothing or interpolation, and too large in fine anatomy.
+        In a smooth field, the tensor at a node minus the mean of its two neighbours along an axis is only noise, with
+        √1.5 times the standard deviation of the noise at one node. The median of these differences over all nodes and
+        axes hardly depends on the few nodes at edges of the anatomy. The noise must be independent between nodes. The
+        estimate is too small after smoothing or interpolation, and too large in fine anatomy.
 
         Args:
             tensors: (*shape, d, d), the measured tensors.

@@ -30,10 +30,9 @@ _SIGNS = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
 _BALANCED = len(_SIGNS)
 """The number of noisy tensor fields in one balanced sample, one for each corner of the tetrahedron."""
 _LEAST = 8
-"""The least number of noisy tensor fields for estimates of the bias, and of the variance of second order in the
-noise."""
+"""The least number of noisy tensor fields for estimates of the bias and of the variance's second-order part."""
 _SCALE = 0.5
-"""The factor of samples of the noise before they are added to the measured tensors, which already contain noise."""
+"""The factor s of samples of the noise that are added to measured tensors, less than 1, as these contain noise, too."""
 _FLOOR = 0.01
 """The fraction of the measured mean eigenvalue to which smaller eigenvalues of indefinite noisy tensors are raised."""
 _LOUD = 3.0
@@ -41,7 +40,7 @@ _LOUD = 3.0
 
 
 class _Moments(eqx.Module):
-    """Sums over balanced samples: squared first-order changes, and mean and squared deviations of second-order ones."""
+    """Sums over balanced samples: squared first-order changes of the value; mean and spread of second-order changes."""
 
     n: Array
     odd: Any
@@ -62,9 +61,9 @@ class _Moments(eqx.Module):
 # Let η₁, η₂, η₃ be independent samples of noise with the covariance Σ. The four sums δ = (±η₁ ± η₂ ± η₃)/√3 with an
 # even number of minus signs form a tetrahedron and add up to zero; each δ has the covariance Σ. Let y₁, …, y₄ be the
 # function's values at D + sδ, where D are the measured tensors and s is `_SCALE`. Because the δ add up to zero, the
-# mean of the y minus the value at D is of second order in δ, and has the expectation s² times the bias. To first order,
-# y₁ + y₂ − y₃ − y₄ is 4sJη₁/√3 with the Jacobian J of the function; similar sums give Jη₂ and Jη₃, and so three samples
-# of the error. A quadratic form of δ, averaged over the four δ, has a third of the variance that it has for one δ.
+# mean of the y minus the value at D is of second order in δ, and has the expectation s² times the bias. To first order
+# in δ, y₁ + y₂ − y₃ − y₄ is 4sJη₁/√3 with the Jacobian J of the function. Similar sums give Jη₂ and Jη₃, and thus three
+# samples of the error. A quadratic form of δ, averaged over the four δ, has a third of its variance for one δ.
 @jax.jit
 def _parts(maps: list[Any], value: Any) -> tuple[Any, Any]:
     def linear(*y: Array) -> Array:
@@ -100,10 +99,11 @@ def uncertainty(
         bars = hj.uncertainty(signature, D, hj.TensorNoise.relative(D, 0.1))
         bars.deviation, bars.bias, bars.interval(0.95), bars.z(1.0), bars.summary()
 
-    Samples δ of the noise are drawn in groups of four that add up to zero. The function is evaluated at D + δ/2, where
-    D are the measured tensors. The differences of the four values give three samples of the error of the value at D,
-    and their mean gives the bias. Half of δ is added, because D already contains noise: the whole δ would exaggerate
-    second-order effects. The relative error of a standard deviation is 29 % with 8 draws, and 8 % with 100 draws.
+    Samples δ of the noise are drawn in groups of four that add up to zero, and the function is evaluated at D + δ/2,
+    where D are the measured tensors. The differences of the four values of a group give three samples of the error of
+    the value at D, and the mean of the four values gives the bias. Half of δ is added, because D already contains
+    noise: the whole sample δ would exaggerate second-order effects. The relative error of a standard deviation is 29 %
+    with 8 draws, and 8 % with 100 draws.
 
     Args:
         function: maps tensors (*shape, d, d) to an array, or to a pytree of arrays. JAX must be able to trace the
@@ -116,17 +116,15 @@ def uncertainty(
             the bias and the second-order variance. ``"auto"`` chooses ``"exact"`` if the result has at most `draws`
             numbers, or else ``"resample"``, because a product with the Jacobian of a signature takes as long as
             computing one or two signatures.
-        draws: the number of noisy tensor fields (for ``"linear"``, of products), at least 8; rounded up to a multiple
-        of 4.
+        draws: the number of noisy tensor fields (products for ``"linear"``), at least 8; rounded up to multiples of 4.
         smoothing: the standard deviation, in coordinate units, of a Gaussian that smooths the tensors before the
             function is evaluated (see `smooth_tensors`); the noise must have a grid. 0 for no smoothing.
         seed: the seed of the random numbers.
         compiled: whether to compile the function once for all draws; if false, the function is called as it is.
         progress: a function that is called with a short text after every four noisy tensor fields.
         checkpoint: a file that is written after every four noisy tensor fields. If it exists, resampling continues.
-        each: a function that is called with each sample of the value's error, three for every four noisy tensor fields,
-            for example to compute covariances or errors of means. Samples in a checkpoint are not passed to `each`
-            again.
+        each: a function that is called with each sample of the value's error (three for every four noisy tensor
+            fields), for example to compute covariances. It is not called again for samples in a checkpoint.
 
     Returns:
         The value with its standard deviation, its bias and their accuracy. Under `jit`, `method` must not be
@@ -137,7 +135,7 @@ def uncertainty(
             belongs to another computation.
 
     Warns:
-        AccuracyWarning: if intervals are not trusted, because noise makes tensors indefinite or acts nonlinearly.
+        AccuracyWarning: if intervals are not reliable, because noise makes tensors indefinite or acts nonlinearly.
 
     Examples:
         >>> noise = hj.TensorNoise.relative(field.tensors, 0.1)

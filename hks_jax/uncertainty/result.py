@@ -12,9 +12,9 @@ from jaxtyping import Array, Float
 from hks_jax.checks import require_number
 
 BEYOND = 0.02
-"""The largest ratio `beyond_linear`, in the median over a map, with which intervals are trusted."""
+"""Confidence intervals are reliable if the median of `beyond_linear` over a map is at most this number."""
 INDEFINITE = 0.02
-"""The largest share of tensors that noise may make indefinite if intervals are trusted."""
+"""Confidence intervals are reliable if noise makes at most this share of the tensors indefinite."""
 
 
 class Uncertainty(eqx.Module):
@@ -28,7 +28,7 @@ class Uncertainty(eqx.Module):
         deviation: the standard deviation of the value due to noise.
         bias: the mean of the function over the noise, minus the value without noise.
         bias_error: the standard deviation of ``bias``, which is estimated from few draws.
-        beyond_linear: the variance of the value of second order in the noise, divided by the variance of first order.
+        beyond_linear: the part of the variance of second order in the noise, divided by the part of first order.
         smear: the change of the value if the smoothed tensors are smoothed once more, an estimate of the change that
             smoothing causes; None without smoothing.
         indefinite: the share of the measured tensors that a sample of the noise, added as a whole, makes indefinite.
@@ -54,8 +54,7 @@ class Uncertainty(eqx.Module):
 
     def __repr__(self) -> str:
         shapes = jax.tree.map(jnp.shape, self.value)
-        sure = f"error of the deviation {self.sampling_error:.0%}"
-        return f"Uncertainty({shapes}, {self.method}, {self.draws} draws, {sure})"
+        return f"Uncertainty({shapes}, {self.method}, {self.draws} draws, deviation ± {self.sampling_error:.0%})"
 
     @property
     def corrected(self) -> Any:
@@ -79,9 +78,9 @@ class Uncertainty(eqx.Module):
 
     @property
     def trusted(self) -> Any:
-        """Whether intervals are trusted: one bool for each number, or for each entry of the first axis of maps.
+        """Whether the intervals are reliable: one bool for each number, or for each entry of the first axis of maps.
 
-        Intervals are trusted if `beyond_linear` is at most 2 % in the median over the map, the bias is at most the
+        Intervals are reliable if `beyond_linear` is at most 2 % in the median over the map, the bias is at most the
         standard deviation in the median, and noise makes at most 2 % of the tensors indefinite.
         """
 
@@ -89,7 +88,7 @@ class Uncertainty(eqx.Module):
             maps = (len(deviation) if deviation.ndim > 1 else deviation.size, -1)
             share = jnp.abs(bias / jnp.where(deviation > 0, deviation, jnp.nan)).reshape(maps)
             second = jnp.where(deviation > 0, beyond, jnp.nan).reshape(maps)
-            # An estimate from few draws has a median below its mean: the limit is multiplied by median/mean.
+            # The median of an estimate from few draws is below its mean; the limit is multiplied by median/mean.
             limit = BEYOND * float(scipy.special.fdtri(self.samples, min(self.freedom, 1e6), 0.5))
             small = (jnp.nanmedian(second, axis=1) <= limit) & (jnp.nanmedian(share, axis=1) <= 1)
             return (small & (self.indefinite <= INDEFINITE)).reshape(deviation.shape[:1])
@@ -100,7 +99,7 @@ class Uncertainty(eqx.Module):
     def signal_to_noise(self) -> Any:
         """The signal-to-noise ratio √((V − N)/N) for each entry of the value's first axis, for example for each time.
 
-        V is the variance of the measured value over the nodes, and N is the mean variance of its noise, a part of V.
+        V is the variance of the noisy value over the nodes, and N is the mean variance of the noise over the nodes.
         """
         return self.signal_to_noise_at(True)
 
@@ -123,14 +122,14 @@ class Uncertainty(eqx.Module):
         """Return warnings about the accuracy of these numbers, as sentences."""
         if (share := float(self.indefinite)) > INDEFINITE:
             return [
-                f"intervals are not trusted, because noise makes {share:.2%} of the tensors indefinite. Smooth the "
+                f"intervals are not reliable, because noise makes {share:.2%} of the tensors indefinite. Smooth the "
                 "tensors (smoothing=), or leave the noisiest nodes out of the mask"
             ]
         claimed = np.concatenate([np.asarray(each).ravel() for each in jax.tree.leaves(self.trusted)])
         if claimed.all():
             return []
         return [
-            f"intervals are not trusted for {int((~claimed).sum())} of {claimed.size} numbers or maps: the effect of "
+            f"intervals are not reliable for {int((~claimed).sum())} of {claimed.size} numbers or maps: the effect of "
             "noise is not linear, or the bias exceeds the deviation (see `trusted`). Smooth the tensors (smoothing=)"
         ]
 
