@@ -34,8 +34,8 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
     degenerate points are merged into one, whose index is the sum of their indices (Tricoche and others 2001).
 
     The function does not find degenerate points of index 0, two points of opposite index closer than `merge` cells, or
-    points on the rim of the domain. If the eigenvalues are equal on a curve or in a region inside the domain, the
-    function finds the centre of the curve or region, unless its index is 0.
+    points on the rim of the domain. If the eigenvalues are equal on a curve or in a region that does not touch the rim,
+    the function finds the centre of the curve or region, unless its index is 0.
 
     Args:
         field: a 2D field. Cells with a node outside the mask are not part of the domain.

@@ -109,10 +109,10 @@ positive_or_nan = numpy_where_known()(nan_unless_positive)
 
 
 # Let S be a matrix of trace zero. By the Cayley–Hamilton theorem S² = qI with a number q (d = 2), or S³ = pS + |S| I
-# with a number p (d = 3). So exp S is a polynomial in S of degree d − 1, whose coefficients are entire functions of q,
-# or of p and |S|. No eigenvalues are needed, and derivatives of any order are smooth where eigenvalues coincide.
-# Taylor's series gives the coefficients of the matrix E = exp(S/2ⁿ) − I. Replacing the matrix E by 2E + E² doubles its
-# exponent, and keeps the relative accuracy of E; n replacements give exp S − I.
+# with a number p (d = 3). So exp S is a polynomial in S of degree d − 1, whose coefficients are entire functions of the
+# number q, or of p and the determinant |S|. No eigenvalues are needed, and derivatives of any order are smooth where
+# eigenvalues coincide. Taylor's series gives the coefficients of the matrix E = exp(S/2ⁿ) − I. Replacing the matrix E
+# by 2E + E² doubles its exponent, and keeps the relative accuracy of E; n replacements give exp S − I.
 _SQUARINGS, _TERMS = 8, 20
 
 

@@ -123,7 +123,7 @@ def varadhan_distance(
     See Varadhan 1967 and Zobel, Reininghaus and Hotz, section 2. At a time t > 0 the kernel in n dimensions is
     (4πt)^(−n/2) exp(−d²/4t) (u₀ + O(t)), where the function u₀ is 1 on a flat domain away from its boundary. Division
     by the diagonal, k_t(x_s, x)/√(k_t(x_s, x_s) k_t(x, x)), removes the power of t. The normalised kernel estimates d²
-    with the error −4t log u₀ + O(t²). The kernel without normalisation adds 2nt log 4πt to this error of d².
+    with the error −4t log u₀ + O(t²). The kernel without normalisation adds 2nt log 4πt to the error of d².
 
     Small times need fine grids and many pairs: with linear elements of node spacing h, d² has the relative error
     h²d²/48t², and exp(−d²/4t) must exceed the truncation and rounding errors. The result is NaN where the estimated
@@ -132,7 +132,8 @@ def varadhan_distance(
 
     Args:
         pairs: the result of `eigenpairs`; more pairs resolve larger distances. Geodesics stay in the domain: they go
-            around holes and across periodic sides. Straight sides cause no error under ``"mirror"`` and ``"mean"``.
+            around holes and across periodic sides. Under ``"mirror"`` and ``"mean"`` straight sides have no effect if
+            the metric is flat.
         times: (n_times,) positive, in (metric length)²; a time near d·h suits distances d on a grid of node spacing h.
         sources: node indices (n_sources, d), or (d,) for one source; vertex numbers (n_sources,) on a mesh.
         normalised: whether to divide by the diagonal. The unnormalised result depends on the unit of length, and is NaN
@@ -186,9 +187,9 @@ def _broadcast(values: Any, space: FunctionSpace) -> Any:
 #
 # On an axis with the node spacing h, linear elements give a wave of frequency ξ the eigenvalue λ = ξ² (1 + ξ²h²/12) and
 # the mass m = 1 − ξ²h²/6. In the kernel ∫ exp(iξd − tλ)/m dξ at the distance d, the means of powers of ξ are ⟨ξ²⟩ = (2t
-# − d²)/4t² and ⟨ξ⁴⟩ = (d⁴ − 12td² + 12t²)/16t⁴. To first order in h² the error of the squared distance is d²h² (d² −
-# 4t)/48t², or −d²h² (d² − 12t)/48t² with a lumped mass. The error matters where d² is several times t. There its ratio
-# to d² is about d²h²/48t², or (h²/12t) log(1/k) with d² = 4t log(1/k) for the normalised kernel k.
+# − d²)/4t² and ⟨ξ⁴⟩ = (d⁴ − 12td² + 12t²)/16t⁴. To first order in h² the estimate of d² has the error d²h² (d² −
+# 4t)/48t², or −d²h² (d² − 12t)/48t² with a lumped mass. Where d² is several times t, and the error matters, the
+# relative error is about d²h²/48t², or (h²/12t) log(1/k) if d² is 4t log(1/k) with the normalised kernel k.
 def _least_kernels(
     pairs: Eigenpairs, times: Float[Array, " m"], nodes: Int[np.ndarray, " s"]
 ) -> tuple[Float[Array, "m 1 *ones"], Float[Array, "m s *shape"]]:

@@ -143,8 +143,8 @@ def mixing(
         # The sum f(low) + high · ``of_f`` has the same value, but its terms cancel, because f usually decreases.
         of_lambda_f = jnp.where(gap >= 0, f[:, None], f[None]) + low * of_f
         size = jnp.maximum(jnp.abs(f), jnp.abs(values * jnp.diagonal(of_f)))
-        # Let pairs i and j both be negligible. Their divided difference is at most f' at one of them if f is monotone,
-        # and otherwise at most ε divided by the relative gap of λᵢ and λⱼ. NaN counts as not negligible.
+        # For two negligible pairs i and j, the divided difference is at most f' at one of them if f is monotone, and at
+        # most ε divided by the relative gap of λᵢ and λⱼ if f is not. NaN counts as not negligible.
         negligible = size <= jnp.finfo(f.dtype).eps * jnp.max(jnp.where(values > 0, size, 0))
         return f, of_f, of_lambda_f, ~negligible
 

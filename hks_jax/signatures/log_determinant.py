@@ -51,8 +51,8 @@ def heat_coefficients(
 ) -> Float[Array, " 3"]:
     """Return a₀, a₁, a₂ of the heat trace Σ exp(−λᵢt) ~ a₀/t + a₁/√t + a₂ of a surface (Kac 1966; McKean, Singer 1967).
 
-    With area V, boundary length L, Euler characteristic χ and corner angles θ, these are a₀ = V/4π, a₁ = ±L/8√π (+ for
-    Neumann conditions) and a₂ = χ/6 + Σ (π − θ)²/24πθ.
+    With area V, boundary length L, Euler characteristic χ and corner angles θ, the coefficients are a₀ = V/4π, a₁ =
+    ±L/8√π (+ for Neumann conditions) and a₂ = χ/6 + Σ (π − θ)²/24πθ.
 
     Args:
         pairs: the result of `eigenpairs` in 2D. Under "mirror" and "mean", V is the area of the doubled domain.

@@ -32,7 +32,7 @@ _BALANCED = len(_SIGNS)
 _LEAST = 8
 """The least number of noisy tensor fields for estimates of the bias and of the variance's second-order part."""
 _SCALE = 0.5
-"""The factor s of samples of the noise that are added to measured tensors, less than 1, as these contain noise, too."""
+"""The factor s of samples of the noise. It is less than 1, because the measured tensors already contain noise."""
 _FLOOR = 0.01
 """The fraction of the measured mean eigenvalue to which smaller eigenvalues of indefinite noisy tensors are raised."""
 _LOUD = 3.0
@@ -63,7 +63,7 @@ class _Moments(eqx.Module):
 # function's values at D + sδ, where D are the measured tensors and s is `_SCALE`. Because the δ add up to zero, the
 # mean of the y minus the value at D is of second order in δ, and has the expectation s² times the bias. To first order
 # in δ, y₁ + y₂ − y₃ − y₄ is 4sJη₁/√3 with the Jacobian J of the function. Similar sums give Jη₂ and Jη₃, and thus three
-# samples of the error. A quadratic form of δ, averaged over the four δ, has a third of its variance for one δ.
+# samples of the error. The mean of a quadratic form over the four δ has a third of the variance of the form at one δ.
 @jax.jit
 def _parts(maps: list[Any], value: Any) -> tuple[Any, Any]:
     def linear(*y: Array) -> Array:
