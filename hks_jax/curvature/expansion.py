@@ -56,8 +56,8 @@ def hks_expansion(
     of nodal tensors, the coefficients come from finite differences of sixth order, which are one-sided near the sides
     of a grid and the rim of a mask. Near sides and rims, the error of u₂ is of fourth order and the error of u₃ is of
     second order in the node distance h. For the machine precision ε, the relative rounding error of u₃ is about
-    ε(t/h²)³/5, and a hundred times larger within eight nodes of a side or rim. In float32 keep t below 30 h² or `order`
-    below 3. The result is NaN outside the mask, and where no stencil fits into the mask.
+    ε(t/h²)³/5, and a hundred times larger within eight nodes of a side or rim. In float32, keep the times t below 30 h²
+    or `order` below 3. The result is NaN outside the mask, and where no stencil fits into the mask.
 
     Args:
         field: the metric, d = 2 or 3.

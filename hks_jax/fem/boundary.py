@@ -84,7 +84,7 @@ def default_boundary(inside: Bool[np.ndarray, "*shape"]) -> tuple[str, str]:
     every_axis = (False,) * inside.ndim
     elements = active_elements(inside, every_axis)
     free = element_nodes(elements, every_axis) & ~rim_nodes(elements, every_axis)
-    if not free[(slice(1, -1),) * inside.ndim].any():  # the mean needs nodes off the sides and the rim
+    if not free[(slice(1, -1),) * inside.ndim].any():  # the mean needs nodes away from sides and rim
         return "neumann", "the mask is so thin that all voxels are on the rim, but the mean needs inner voxels"
     return "mean", 'the domain has a mask; for the natural condition on its rim, pass boundary="neumann"'
 
@@ -126,7 +126,7 @@ def reflect(field: TensorField, width: int) -> TensorField:
     """Extend a field by a strip of its mirror image on every side, as in the paper; `crop` removes the strip.
 
     A reflection is an isometry only if the off-diagonal components of the tensors across the mirror change sign. In the
-    strip beyond a side of axis a, the components Tₐᵦ with b ≠ a are therefore negated. Any mask is also reflected.
+    strip beyond a side of axis a, the tensor components Tₐᵦ with b ≠ a are negated. `reflect` also reflects a mask.
 
     Args:
         field: the field on a grid of shape (n₁, …).

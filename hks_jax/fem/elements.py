@@ -72,10 +72,9 @@ def tensor_product_element(dimension: int, point: float = GAUSS) -> Element:
     return Element(reduce(np.kron, [h] * dimension), np.stack(gradients, axis=-1), np.full(n, 1 / n))
 
 
-# The d + 1 quadrature points have equal weights. One barycentric coordinate of each point is 1 − d·a, and the other d
-# coordinates are a. The rule is exact for polynomials of degree two if the product of two coordinates has the mean
-# 1/((d + 1)(d + 2)) over the points. For a this means 2a(1 − d·a) + (d − 1)a² = 1/(d + 2), with the smaller solution
-# ``beside``.
+# The d + 1 quadrature points have equal weights. One barycentric coordinate of each quadrature point is 1 − d·a, and
+# the other d coordinates equal a. The rule is exact for polynomials of degree two if the product of two coordinates has
+# the mean 1/((d + 1)(d + 2)) over the points: 2a(1 − d·a) + (d − 1)a² = 1/(d + 2), where the smaller a is ``beside``.
 def _linear_rule(d: int) -> tuple[Float[np.ndarray, "q n"], Float[np.ndarray, " q"]]:
     beside = (d + 2 - math.sqrt(d + 2)) / ((d + 1) * (d + 2))
     points = np.full((d + 1, d + 1), beside) + (1 - (d + 1) * beside) * np.eye(d + 1)
@@ -130,27 +129,27 @@ hourglass modes (alternating nodal values) have no energy."""
 
 
 # Derivation for a constant tensor T = A⁻¹: on a grid with the spacing hₐ along axis a, a plane wave with the wave
-# vector k changes its phase by θₐ = kₐhₐ between neighbouring nodes. The symbol of a matrix is the factor by which it
-# multiplies the wave. If the mass has the quadrature points ±ξ, its symbol along one axis is 1 − μθ² + O(θ⁴), where
-# μ = (1 − ξ²)/4. In the stiffness, a product of two derivatives has the symbol k²(1 − θ²/12), and a derivative times a
-# value has the symbol (sin θ)/h, both for every ξ. Along an axis without a derivative, the stiffness has the symbol
-# 1 − νθ² + O(θ⁴), where ν = (1 − ξ²)/4 for the points ±ξ of the stiffness. The exact eigenvalue of the wave is
-# λ = Σ Aₐᵦkₐkᵦ, and its discrete eigenvalue is, to leading order,
+# vector k changes its phase by θₐ = kₐhₐ between neighbouring nodes. The symbol of a matrix is the factor by which the
+# matrix multiplies a plane wave. If the mass has the quadrature points ±ξ, its symbol along one axis is 1 − μθ² +
+# O(θ⁴), where μ = (1 − ξ²)/4. In the stiffness, a product of two derivatives has the symbol k²(1 − θ²/12), and a
+# derivative times a value has the symbol (sin θ)/h, both for every ξ. Along an axis without a derivative, the stiffness
+# has the symbol 1 − νθ² + O(θ⁴), where ν = (1 − ξ²)/4 for the points ±ξ of the stiffness. The exact eigenvalue of the
+# wave is λ = Σ Aₐᵦkₐkᵦ, and its discrete eigenvalue is, to leading order,
 #
 #     λ + λ μ Σₐ θₐ² − Σₐ Aₐₐkₐ² (θₐ²/12 + ν Σ_{b≠a} θᵦ²) − Σ_{a<b} 2Aₐᵦkₐkᵦ ((θₐ² + θᵦ²)/6 + ν Σ_{c≠a,b} θ_c²).
 #
 # With μ = 1/12 for the mass and ν = 1/12 for the stiffness, the eigenvalue has the error −Σ_{a<b} 2Aₐᵦkₐkᵦ
 # (θₐ² + θᵦ²)/12, which is zero for a diagonal tensor. For a tensor that is not diagonal, no stencil with 3^d couplings
 # cancels the error of every plane wave. But the value ν = 1/12 + δ for the stiffness cancels the mean of the error over
-# the heat kernel, in which the phases θ are normally distributed with a covariance proportional to Sₐᵦ = hₐhᵦTₐᵦ. With
-# the inverse B of S, Aₐᵦkₐkᵦ = Bₐᵦθₐθᵦ, and Isserlis' theorem for expectations,
+# the heat kernel, in which the phases θ are normally distributed with a covariance proportional to Sₐᵦ = hₐhᵦTₐᵦ. For
+# the inverse B of the matrix S, Aₐᵦkₐkᵦ = Bₐᵦθₐθᵦ. Isserlis' theorem for expectations,
 # E θₐθᵦθ_cθ_e = SₐᵦS_ce + Sₐ_cSᵦ_e + Sₐ_eSᵦ_c, gives the correction
 #
 #     δ = −(1/12) Σ_{a<b} 2Bₐᵦ E(θₐ³θᵦ + θₐθᵦ³) / (Σ_{a≠b} Bₐₐ E θₐ²θᵦ² + Σ_{a<b} Σ_{c≠a,b} 2Bₐᵦ E θₐθᵦθ_c²).
 #
-# The correction δ depends neither on the time t nor on the size of S. In two dimensions δ = S₁₂²/2(S₁₁S₂₂ + 2S₁₂²), so
-# that ξ² = 2/3 − 4δ for the points ±ξ of the stiffness is between 0 and 2/3. The denominator of δ is positive, because
-# it equals the expectation Σ_c E(θ_c² Σ_{a,b≠c} Bₐᵦθₐθᵦ).
+# The correction δ depends neither on the time t nor on the size of the matrix S. In two dimensions δ = S₁₂²/2(S₁₁S₂₂ +
+# 2S₁₂²), so that ξ² = 2/3 − 4δ for the points ±ξ of the stiffness is between 0 and 2/3. The denominator of δ is
+# positive, because it equals the expectation Σ_c E(θ_c² Σ_{a,b≠c} Bₐᵦθₐθᵦ).
 #
 # The mass makes nodal values of functions of norm 1 too large by the factor 1 + Σ μθₐ²/2, which `Pencil.read` corrects.
 def stiffness_point(metric: Float[Array, "d d"], spacing: Float[np.ndarray | Array, " d"]) -> Float[Array, ""]:
@@ -169,9 +168,8 @@ def stiffness_point(metric: Float[Array, "d d"], spacing: Float[np.ndarray | Arr
     return jnp.clip(2 / 3 + numerator / (3 * denominator), _LEAST, _GREATEST)
 
 
-# At the points ±ξ of the stiffness only shape functions are evaluated; tensors are evaluated at Gauss points, which
-# integrate tensors accurately. With tensors at the points ±ξ, the errors of signatures of brain images were twice as
-# large.
+# The stiffness evaluates shape functions at its quadrature points ±ξ, but tensors at Gauss points, which integrate
+# tensors accurately. With tensors at the points ±ξ, the errors of signatures of brain images were twice as large.
 #
 # On a cell, a function is a linear combination of products of coordinates, one for each set of axes. The derivative of
 # a product of m coordinates is a product of m − 1 coordinates, which are ±ξ at the quadrature points. If the derivative

@@ -141,7 +141,7 @@ def _grid_integrals(
     interpolation: Interpolation,
     operator: WeakForm,
 ) -> tuple[Array, Array, Array, Array]:
-    """Return stiffness and mass as stencils (as element matrices for vector functions), row sums and the volume."""
+    """Return stiffness and mass as stencils (as element matrices for vectors), the mass's row sums and the volume."""
     element = Element(tensor_product_element(len(periodic)).values, gradients, weights)
     tensors = spd.positive_or_nan(spd.identity_outside(tensors, domain))
 

@@ -119,8 +119,8 @@ class MirrorPencil(eqx.Module):
         parts: the 2^m pencils; the first one has Neumann conditions on all mirrors and glued rims.
         including: for each part, itself and the earlier parts whose function spaces contain its function space. By the
             min–max principle, eigenvalue i of a part is not less than eigenvalue i of a part with a larger function
-            space. A part that is contained in c parts has at most the fraction 1/c of the lowest eigenvalues of the
-            doubled domain.
+            space. A part whose functions belong to c parts has at most the fraction 1/c of the lowest eigenvalues of
+            the doubled domain.
     """
 
     parts: tuple[Pencil, ...]
@@ -199,7 +199,7 @@ def assembled(
 
 # With a potential V and a density ρ, the stiffness is K = A + ∫ρV hᵢhⱼ, where A ⪰ 0. If the potential is at least v at
 # the quadrature points, K − vM ⪰ 0 for the mass M from the same quadrature points. The lumped mass D ⪰ M exceeds the
-# consistent mass M, so that K − vD ⪰ 0 is certain only for a bound v ≤ 0.
+# consistent mass M, so that K − vD ⪰ 0 is certain only if the least potential v is not positive.
 def _least(potential: Field, space: FunctionSpace, operator: WeakForm) -> Float[Array, ""] | None:
     """Return a lower bound of the spectrum, or None if the interpolated potential may fall below its nodal values."""
     if potential.at == "nodes" and isinstance(space, MeshSpace) and space.degree == 2:

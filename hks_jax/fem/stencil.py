@@ -22,7 +22,7 @@ from hks_jax.linear.pattern import Pattern
 from hks_jax.linear.products import of_each_row
 
 _CELL = {2: 25, 3: 64}
-"""The number of nodes up to which bisection leaves a part whole. Smaller numbers save operations, but add batches."""
+"""The number of nodes up to which bisection leaves a part whole; smaller numbers save operations, but add batches."""
 
 
 @jax.tree_util.register_static
@@ -121,7 +121,7 @@ class Stencil(eqx.Module):
         return self.of_columns()(x)
 
     def of_columns(self) -> Callable[[Float[Array, "*shape b"]], Float[Array, "*shape b"]]:
-        """Return the function that multiplies columns; to be called outside loops, since it rearranges coefficients."""
+        """Return the function that multiplies columns; call `of_columns` outside loops: it rearranges coefficients."""
         apply = self.of_rimmed()
         return (lambda x: apply(x, x)) if self.is_diagonal else (lambda x: apply(x, self.rimmed(x)))
 
@@ -141,8 +141,8 @@ class Stencil(eqx.Module):
         if self.slabs is not None or any(self.periodic):
             of_box = product_with_rim(self.coefficients)
             return lambda _, rimmed: of_box(rimmed)
-        # In the flat order of the nodes, each neighbour is at a fixed distance. Where a neighbour's distance leads
-        # across a side of the grid, the coefficient is zero, since no element couples the two nodes.
+        # In the flat order of the nodes, each neighbour is at a fixed distance. If this distance leads across a side of
+        # the grid, the coefficient of the neighbour is zero, since no element couples the two nodes.
         distances, reach = _distances(self.coefficients.shape[1:])
         row = side_by_side(self.coefficients).reshape(-1, len(distances))
         nodes = len(row)
@@ -219,7 +219,7 @@ class StencilOperator(PatternedOperator):
         free, numbers = np.flatnonzero(self.space.free), self.space.degrees_of_freedom
         if free.size == numbers.size:
             return lambda x: product_with(x.reshape(*shape, -1)).reshape(x.shape)
-        numbers = np.where(numbers < 0, free.size, numbers)  # an index out of range, read as 0
+        numbers = np.where(numbers < 0, free.size, numbers)  # an index out of range where a node is not free
 
         def product_of_free(x: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
             nodal = x.at[numbers].get(mode="fill", fill_value=0)

@@ -78,9 +78,9 @@ def reach_bound(distance: Any, reach_time: Any, low: float, across: float) -> An
     bound is close to the Gaussian kernel exp(−s²/2tκ) for s ≪ tκ, and to the decay of a random walk for s ≫ tκ.
 
     A consistent mass M has a nonlocal inverse. The symmetric part of exp(ψ) M exp(−ψ) is M + (cosh α − 1) C, where C
-    holds the couplings of M across the axis and −C ⪯ βM. The symmetric part is at least low (1 − β (cosh α − 1)) D, so
-    that entries of M⁻¹ at the distance s are at most exp(−αs) divided by this multiple of D. The product of the bounds
-    on the kernel and on M⁻¹ is a bound for t → 0 and for a constant metric, but not proven for varying metrics at other
+    holds the couplings of M across the axis and −C ⪯ βM, and so at least low (1 − β (cosh α − 1)) D. Entries of M⁻¹ at
+    the distance s are therefore at most exp(−αs) divided by low (1 − β (cosh α − 1)) D. The product of the bounds on
+    the kernel and on M⁻¹ is a bound for t → 0 and for a constant metric, but not proven for varying metrics at other
     times t.
     """
     s = np.asarray(distance, float)
@@ -127,10 +127,10 @@ def error_bound(spacing: tuple[int, ...], degree: int, time: float, limits: Boun
 def mass_error(mass_degree: int, time: float, limits: Bounds, dimension: int) -> float:
     """Return a bound, to first order in ε, on the relative error due to the approximation P = p(D⁻¹M)D⁻¹ of M⁻¹.
 
-    The polynomial p has the error ε = max |1 − μ p(μ)| over the eigenvalues μ of D⁻¹M. The norm of the matrix E in
-    P = M^(−½)(1 − E)M^(−½) is at most ε. For a node x, with w = M^(−½)e_x and S = M^(−½)KM^(−½), Duhamel's formula and,
-    at small times, integration by parts bound the error by 4.5 ε ‖w‖ ‖exp(−St/4)w‖ = 4.5 ε √((M⁻¹)ₓₓ HKS(t/2, x)).
-    Since low bounds the eigenvalues of D⁻¹M from below, both (M⁻¹)ₓₓ and HKS(t/2, x) are at most 1/(low D). The
+    The polynomial p has the error ε = max |1 − μ p(μ)| over the eigenvalues μ of D⁻¹M. In P = M^(−½)(1 − E)M^(−½), the
+    norm of the matrix E is at most ε. For a node x, with w = M^(−½)e_x and S = M^(−½)KM^(−½), Duhamel's formula and, at
+    small times, integration by parts bound the error of the signature by 4.5 ε ‖w‖ ‖exp(−St/4)w‖ = 4.5 ε √((M⁻¹)ₓₓ
+    HKS(t/2, x)). Since low is the least eigenvalue of D⁻¹M or less, (M⁻¹)ₓₓ and HKS(t/2, x) are at most 1/(low D). The
     returned bound is relative to the unit that `_unit` defines.
     """
     low = limits.low
@@ -144,8 +144,8 @@ def rounding_error(time: float, limits: Bounds, dimension: int, eps: float) -> f
     """Return an estimate of the rounding error of the signature, relative to the unit that `_unit` defines.
 
     The vectors of the Chebyshev recurrence have entries of up to 1/(low D), like M⁻¹, and their rounding gives the term
-    1/low of the estimate. The rounding of the row sums D of M gives the term 1. Measured rounding errors did not grow
-    with the degree of the expansion, and were 0.05 to 0.7 times the estimate in float32.
+    1/low of the estimate. The rounding of the row sums D of M gives the term 1 of the estimate. Measured rounding
+    errors did not grow with the degree of the expansion, and were 0.05 to 0.7 times the estimate in float32.
     """
     return eps * (1 + 1 / limits.low) / _unit(time, limits, dimension)
 

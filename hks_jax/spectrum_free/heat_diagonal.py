@@ -54,7 +54,7 @@ def hks_spectrum_free(
             factors in memory. ``"auto"`` chooses the method with less work. Under `jax.jit`, colouring needs a
             `Colouring` from `colouring`.
         tolerance: a bound on the error of colouring at every node, relative to the smaller of (4πt)^(−d/2) and the
-            largest possible value at a node. A potential with the least value v multiplies this bound by exp(−vt).
+            largest possible value at a node. A potential with the least value v multiplies the bound by exp(−vt).
             `Colouring.error` contains the proven bound. Selected inversion ignores the tolerance.
 
     Raises:
@@ -74,7 +74,7 @@ def hks_spectrum_free(
     settings = choose_method(pencil, times, method, tolerance)
     scale, given = jnp.exp(-origin * times), isinstance(method, Colouring)
     values = [_diagonal(part, times, settings, scale, checked=given) for part in pencil.parts]
-    # The mean over the parts is the signature, because a point source is half the sum of an even and an odd function.
+    # The mean over even and odd parts is the signature: a point source is half the sum of an even and an odd function.
     return jnp.mean(jnp.stack(values), axis=0)
 
 
