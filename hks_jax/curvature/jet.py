@@ -21,7 +21,7 @@ MINIMUM_NODES = 8
 
 @lru_cache
 def stencils(order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sixth-order stencils of a first or second derivative: the centred one, then by increasing shift.
+    """Return the sixth-order stencils of a first or second derivative: the centred one first, others by their shift.
 
     Row i of the offsets (n, 8) and of the weights (n, 8) is stencil i for unit spacing, padded with zeros. For the
     second derivative, a centred stencil of 7 nodes gains an order by symmetry; shifted stencils need 8 nodes.

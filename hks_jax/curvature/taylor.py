@@ -1,9 +1,8 @@
 """Truncated Taylor series in two variables.
 
 A series is the vector of its coefficients in the order 1, x, y, x², xy, y², …, sorted by total degree. Removing the
-last coefficients of the vector truncates the series. Operations on several series truncate all series to the shortest
-one. Nested JAX derivatives would compute mixed derivatives in every order of the variables, and take several times as
-long.
+last coefficients truncates the series. Operations on several series truncate all series to the shortest one. Nested JAX
+derivatives would compute mixed derivatives in every order of the variables, and take several times as long.
 """
 
 from collections.abc import Callable

@@ -19,11 +19,11 @@ BoundarySpec: TypeAlias = str | tuple[str | Sides, ...]
 _SIDE_BY_SIDE = ("neumann", "dirichlet", "mean")
 _CONDITIONS = (*_SIDE_BY_SIDE, "periodic", "mirror")
 _WHOLE_RIM = {"mean": "mean", "dirichlet-rim": "dirichlet"}
-"""The names that, given alone, set one condition on all sides and on a mask's rim, and the condition of each name."""
+"""Names that set one condition on all sides and on the rim of a mask, if `boundary` is the name, and this condition."""
 
 
 def normalise_boundary(boundary: BoundarySpec, dimension: int) -> tuple[Sides, ...]:
-    """Return the conditions (low, high) of every axis, and a last pair that holds the condition of a mask's rim twice.
+    """Return a pair of conditions (low, high) for each axis; a last pair repeats the condition on the rim of a mask.
 
     `assemble` describes the argument `boundary`. If `boundary` has no entry for the rim of a mask, the condition on the
     rim is ``"mean"`` if an axis has the mean condition, and natural otherwise.
@@ -68,7 +68,7 @@ def _pair(entry: str | Sides) -> Sides:
 def default_boundary(inside: Bool[np.ndarray, "*shape"]) -> tuple[str, str]:
     """Return the boundary condition that suits a domain, and the reason.
 
-    The condition is ``"mean"`` for a domain whose mask has inner nodes, because the natural condition doubles
+    The suitable condition is ``"mean"`` for a domain whose mask has inner nodes, because the natural condition doubles
     signatures beside the rim of the mask. The command line uses `default_boundary`; the functions of the library use
     ``"neumann"`` by default.
 
@@ -123,7 +123,7 @@ def doubled_problems(boundary: tuple[Sides, ...]) -> list[tuple[Sides, ...]]:
 
 
 def reflect(field: TensorField, width: int) -> TensorField:
-    """Extend a field by a strip of its mirror image on every side, as in the paper; `crop` removes the strip.
+    """Extend a field by a mirrored strip on every side, as Zobel, Reininghaus and Hotz do; `crop` removes the strips.
 
     A reflection is an isometry only if the off-diagonal components of the tensors across the mirror change sign. In the
     strip beyond a side of axis a, the tensor components Tₐᵦ with b ≠ a are negated. `reflect` also reflects a mask.

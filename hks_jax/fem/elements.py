@@ -1,4 +1,4 @@
-"""Elements: shape functions at quadrature points, element matrices, and quadrature that cancels the leading error."""
+"""Elements: shape functions at quadrature points, element matrices, and points that cancel an error of signatures."""
 
 import math
 from collections.abc import Mapping
@@ -122,7 +122,7 @@ def simplex_element(dimension: int, degree: int = 1) -> Element:
 Quadrature = Literal["gauss", "cancelling"]
 
 MASS = math.sqrt(2 / 3)
-"""The coordinate ξ of the points ±ξ on each axis of [−1, 1]^d where the mass evaluates shape functions."""
+"""The coordinate ξ of the points ±ξ on each axis of [−1, 1]^d at which a cancelling mass evaluates shape functions."""
 _LEAST, _GREATEST = 0.01, 1.0
 """Bounds of ξ² that keep the quadrature points of the stiffness inside the cell, but away from its centre, where
 hourglass modes (alternating nodal values) have no energy."""
@@ -138,18 +138,18 @@ hourglass modes (alternating nodal values) have no energy."""
 #
 #     λ + λ μ Σₐ θₐ² − Σₐ Aₐₐkₐ² (θₐ²/12 + ν Σ_{b≠a} θᵦ²) − Σ_{a<b} 2Aₐᵦkₐkᵦ ((θₐ² + θᵦ²)/6 + ν Σ_{c≠a,b} θ_c²).
 #
-# With μ = 1/12 for the mass and ν = 1/12 for the stiffness, the eigenvalue has the error −Σ_{a<b} 2Aₐᵦkₐkᵦ
-# (θₐ² + θᵦ²)/12, which is zero for a diagonal tensor. For a tensor that is not diagonal, no stencil with 3^d couplings
-# cancels the error of every plane wave. But the value ν = 1/12 + δ for the stiffness cancels the mean of the error over
-# the heat kernel, in which the phases θ are normally distributed with a covariance proportional to Sₐᵦ = hₐhᵦTₐᵦ. For
-# the inverse B of the matrix S, Aₐᵦkₐkᵦ = Bₐᵦθₐθᵦ. Isserlis' theorem for expectations,
-# E θₐθᵦθ_cθ_e = SₐᵦS_ce + Sₐ_cSᵦ_e + Sₐ_eSᵦ_c, gives the correction
+# With the coefficients μ = 1/12 of the mass and ν = 1/12 of the stiffness, the eigenvalue has the error
+# −Σ_{a<b} 2Aₐᵦkₐkᵦ (θₐ² + θᵦ²)/12, which is zero for a diagonal tensor. For a tensor that is not diagonal, no stencil
+# with 3^d couplings cancels the error of every plane wave. But the coefficient ν = 1/12 + δ of the stiffness cancels
+# the mean of the error over the heat kernel, in which the phases θ are normally distributed with a covariance
+# proportional to Sₐᵦ = hₐhᵦTₐᵦ. For the inverse B of the matrix S, Aₐᵦkₐkᵦ = Bₐᵦθₐθᵦ. Isserlis' theorem for
+# expectations, E θₐθᵦθ_cθ_e = SₐᵦS_ce + Sₐ_cSᵦ_e + Sₐ_eSᵦ_c, gives the correction
 #
 #     δ = −(1/12) Σ_{a<b} 2Bₐᵦ E(θₐ³θᵦ + θₐθᵦ³) / (Σ_{a≠b} Bₐₐ E θₐ²θᵦ² + Σ_{a<b} Σ_{c≠a,b} 2Bₐᵦ E θₐθᵦθ_c²).
 #
-# The correction δ depends neither on the time t nor on the size of the matrix S. In two dimensions δ = S₁₂²/2(S₁₁S₂₂ +
-# 2S₁₂²), so that ξ² = 2/3 − 4δ for the points ±ξ of the stiffness is between 0 and 2/3. The denominator of δ is
-# positive, because it equals the expectation Σ_c E(θ_c² Σ_{a,b≠c} Bₐᵦθₐθᵦ).
+# The correction δ depends neither on the time t nor on the size of the matrix S. In two dimensions
+# δ = S₁₂²/2(S₁₁S₂₂ + 2S₁₂²), so that ξ² = 2/3 − 4δ for the points ±ξ of the stiffness is between 0 and 2/3. The
+# denominator of the correction is positive, because it equals the expectation Σ_c E(θ_c² Σ_{a,b≠c} Bₐᵦθₐθᵦ).
 #
 # The mass makes nodal values of functions of norm 1 too large by the factor 1 + Σ μθₐ²/2, which `Pencil.read` corrects.
 def stiffness_point(metric: Float[Array, "d d"], spacing: Float[np.ndarray | Array, " d"]) -> Float[Array, ""]:

@@ -19,7 +19,7 @@ Place = Literal["everywhere", "nodes", "elements", "points"]
 class Field(eqx.Module):
     """A field on the elements of a domain."""
 
-    values: Float[Array, "..."]  # (*node_shape, …), (*elements, …), (*elements, q, …), or (…) for one value everywhere
+    values: Float[Array, "..."]  # one value (…), or values (*node_shape, …), (*elements, …) or (*elements, q, …)
     at: Place = eqx.field(static=True)  # where the values are given; "points" are quadrature points
 
     def at_points(

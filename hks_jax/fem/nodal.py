@@ -154,10 +154,10 @@ def _of_one(pencil: Pencil) -> Pencil:
 
 # The eigenvalue of the separate equations is the largest quotient Kᵢᵢ/Mᵢᵢ of the free nodes, a Rayleigh quotient, and
 # so at most the largest eigenvalue of the pencil. The quotient Kᵢᵢ/Mᵢᵢ must exceed the lowest quarter of the spectrum.
-# On a uniform grid with a consistent mass, the quotient is 6/h² in 2D and 9/h² in 3D, and the lowest quarter of the
-# spectrum ends at 3.8/h² and 7.6/h². With a lumped mass, the quotient is 2.7/h², and the lowest quarter of the spectrum
-# ends at 2.2/h² in 2D and 2.4/h² in 3D. Because 2.7/h² is so close to the lowest quarter, the quotient of a lumped mass
-# is doubled; the spectrum in 2D then ends at 5.3/h², not at 4/h².
+# With a consistent mass and node spacing h, Kᵢᵢ/Mᵢᵢ is 6/h² in 2D and 9/h² in 3D, and the lowest quarter of the
+# spectrum ends at 3.8/h² and 7.6/h². With a lumped mass, Kᵢᵢ/Mᵢᵢ is 2.7/h², and the lowest quarter of the spectrum ends
+# at 2.2/h² in 2D and 2.4/h² in 3D. Because 2.7/h² is so close to the lowest quarter, the quotient of a lumped mass is
+# doubled; the spectrum in 2D then ends at 5.3/h², not at 4/h².
 @jax.jit
 def _with_others(
     stiffness: Float[Array, "offsets *shape"], mass: Float[Array, "m *shape"], free: Bool[np.ndarray | Array, "*shape"]

@@ -80,7 +80,7 @@ def _dispersion(xp: Any, tensors: Any, spacing: Any, lumped: bool, cancelling: b
 # exact solution p·x + w with the gradient p has a corrector w with ∂ₐ(Aₐₐ∂ₐw) = −(∂ₐA eₐ)·p, where eₐ is the unit
 # vector of axis a. An element lacks the energy of the corrector w, Aₐₐ(∂ₐ²w)² hₐ²/12. For gradients p with the
 # covariance A⁻¹, the missing energy is δAeₐ·A⁻¹δAeₐ/12Aₐₐ, relative to the energy of p along one axis. The estimate
-# holds for √t above the length on which A varies; for smaller t only its order of magnitude is right.
+# holds for √t above the length on which the metric varies; for smaller t only its order of magnitude is right.
 def _turning(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...]) -> Any:
     """Return the relative error (*shape) of eigenvalues due to the variation of tensors between neighbours."""
     root = xp.sqrt(spd.determinant(tensors))[..., None, None]
@@ -98,9 +98,9 @@ def _turning(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...]) -> 
 
 
 # At distance ξ from one of two nodes with the spacing h, linear interpolation has the error ξ(h − ξ)/2 times the second
-# derivative of the interpolated quantity. The mean of ξ(h − ξ)/2 is h²/12. The relative error of the density √|T| is
-# half the trace of T⁻¹ times the error of T. The relative error of the volume is therefore proportional to tr T⁻¹∂ₐ²T
-# if T is interpolated, and to ∂ₐ²log|T| if log T is interpolated.
+# derivative of the interpolated quantity. The mean of ξ(h − ξ)/2 between the nodes is h²/12. The relative error of the
+# density √|T| is half the trace of T⁻¹ times the error of T. The relative error of the volume is therefore proportional
+# to tr T⁻¹∂ₐ²T if T is interpolated, and to ∂ₐ²log|T| if log T is interpolated.
 def _swelling(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...], interpolation: Interpolation) -> Any:
     determinant, inverse = spd.determinant(tensors), spd.inverse(tensors)
     density, total = xp.sqrt(determinant), xp.zeros((), tensors.dtype)

@@ -212,7 +212,7 @@ class VectorSpace(FunctionSpace):
 
 @jax.tree_util.register_static
 class MatrixSpace(FunctionSpace):
-    """The nodes of matrices from elsewhere, for which only the shape of nodal arrays is known."""
+    """The nodes of the user's matrices, for which only the shape of nodal arrays is known."""
 
     dimension: int | None  # type: ignore[assignment]  # None if it is not known
 
@@ -284,7 +284,7 @@ def _outer(axes: Sequence[Bool[np.ndarray, "_m _n"]]) -> Bool[Array, "ms *ns"]:
     whole = tuple(map(int, shapes.ravel()))
     result = jnp.ones((), bool)
     if not all(axis.all() for axis in axes):
-        # The barrier keeps the compiler from computing the outer product during compilation.
+        # The optimization barrier keeps the compiler from computing the outer product during compilation.
         known = jax.lax.optimization_barrier([jnp.asarray(axis) for axis in axes])
         places = [tuple(n if i % d == axis else 1 for i, n in enumerate(whole)) for axis in range(d)]
         result = reduce(jnp.logical_and, [axis.reshape(place) for axis, place in zip(known, places, strict=True)])

@@ -105,7 +105,7 @@ class Stencil(eqx.Module):
 
     coefficients: Float[Array, "offsets *shape"]
     periodic: tuple[bool, ...] = eqx.field(static=True)  # whether each axis is periodic
-    slabs: Slabs | None = eqx.field(default=None, static=True)  # how the grid is divided, if this is one slab of it
+    slabs: Slabs | None = eqx.field(default=None, static=True)  # the grid's division, if the stencil is for a slab
 
     @property
     def is_diagonal(self) -> bool:

@@ -29,7 +29,7 @@ class Colouring:
         degree: the degree of the Chebyshev expansion in M⁻¹K.
         mass_degree: the degree of the polynomial approximation of M⁻¹; 1 for a lumped mass, which is inverted exactly.
         columns: the number of colours that are processed at once.
-        top: the upper bound on the eigenvalues for which the expansion is made.
+        top: the upper bound on the eigenvalues of M⁻¹K for which the expansion is made.
         low: the lower bound on the eigenvalues of D⁻¹M, where the diagonal matrix D holds the row sums of M.
         reach: `Bounds.reach` for each axis, times the longest time.
         across: `Bounds.across` for each axis.
@@ -74,14 +74,14 @@ def reach_bound(distance: Any, reach_time: Any, low: float, across: float) -> An
     The diagonal matrix D holds the row sums of M. Davies' method weights node i along the axis by exp(ψ) with ψ = αi.
     For A = D^(−½)KD^(−½) and the reach κ of `Bounds`, ‖exp(ψ) exp(−tA) exp(−ψ)‖ ≤ exp(t κ (cosh α − 1)): only the
     symmetric part of exp(ψ) K exp(−ψ) matters, in which couplings across the axis are multiplied by cosh α. At the
-    distance s, the kernel is therefore at most exp(−αs + tκ (cosh α − 1)), which is least for sinh α = s/tκ. The least
-    bound is close to the Gaussian kernel exp(−s²/2tκ) for s ≪ tκ, and to the decay of a random walk for s ≫ tκ.
+    distance s, the heat kernel is therefore at most exp(−αs + tκ (cosh α − 1)), which is least for sinh α = s/tκ. The
+    least bound is close to the Gaussian kernel exp(−s²/2tκ) for s ≪ tκ, and to the decay of a random walk for s ≫ tκ.
 
     A consistent mass M has a nonlocal inverse. The symmetric part of exp(ψ) M exp(−ψ) is M + (cosh α − 1) C, where C
-    holds the couplings of M across the axis and −C ⪯ βM, and so at least low (1 − β (cosh α − 1)) D. Entries of M⁻¹ at
-    the distance s are therefore at most exp(−αs) divided by low (1 − β (cosh α − 1)) D. The product of the bounds on
-    the kernel and on M⁻¹ is a bound for t → 0 and for a constant metric, but not proven for varying metrics at other
-    times t.
+    holds the couplings of M across the axis and −C ⪯ βM, and so at least low (1 − β (cosh α − 1)) D. Entries of M⁻¹
+    between nodes at the distance s are therefore at most exp(−αs) divided by low (1 − β (cosh α − 1)) D. The product of
+    the bounds on exp(−tA) and M⁻¹ is a bound on the heat kernel for t → 0 and for a constant metric. For varying
+    metrics at other times t, it is not a proven bound.
     """
     s = np.asarray(distance, float)
     alpha = np.arcsinh(s / reach_time)

@@ -25,11 +25,11 @@ _LARGE = 4096
 """The number of free nodes up to which colouring may take as many vectors as there are nodes."""
 _COLUMNS = 16
 _FASTER = 3.0
-"""The speed of dense products relative to stencils, per operation."""
+"""The number of operations of dense products that take as long as one operation of a stencil."""
 _MEMORY = 8e9
 """The memory in bytes above which selected inversion is not chosen automatically."""
 _FILL = {2: 150, 3: 40}
-"""Lower bounds, by dimension d, on the number of a factor's entries divided by n^(2 − 2/d), for large n."""
+"""Lower bounds, for each dimension d, on a factor's number of entries over n^(2 − 2/d), for large numbers n of rows."""
 
 
 def require_grid(pencil: AnyPencil) -> None:

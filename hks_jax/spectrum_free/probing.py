@@ -44,8 +44,8 @@ def coloured_diagonal(
 
 
 # For the vector v of a colour, the Chebyshev vectors are y₀ = Pv, y₁ = Ây₀ and yₙ₊₁ = 2Âyₙ − yₙ₋₁, with the matrix
-# Â = 2PK/top − 1. The result is the sum of cₙ v∘yₙ over n and the colours, where ∘ multiplies entry by entry. Since
-# P ≈ M⁻¹ and dM⁻¹ = −M⁻¹ dM M⁻¹, the tangent of y₀ is −P dM y₀, and the tangents of aₙ = PKyₙ are
+# Â = 2PK/top − 1. The result is the sum, over n and all colours, of cₙ v∘yₙ with the coefficients cₙ and entrywise
+# products ∘. Since P ≈ M⁻¹ and dM⁻¹ = −M⁻¹ dM M⁻¹, the tangent of y₀ is −P dM y₀, and the tangents of aₙ = PKyₙ are
 # P(dK yₙ + K dyₙ − dM aₙ).
 #
 # The transpose maps a cotangent g of the result by Clenshaw's recurrence pₙ = P(v∘sₙ) + fₙ Âpₙ₊₁ − pₙ₊₂ from the last n

@@ -51,9 +51,9 @@ def mass_bound(pencil: Pencil) -> Float[Array, ""]:
 
 @partial(jax.jit, static_argnames="mass_degree")
 def bounds(pencil: Pencil, low: Float[Array, ""], mass_degree: int) -> Bounds:
-    """Return the bounds of a pencil on a grid, given `mass_bound`.
+    """Return the bounds of a pencil on a grid, given the bound ``low`` from `mass_bound`.
 
-    The upper bound is the smaller of Gershgorin's bound and a Lanczos estimate with a safety margin.
+    The upper bound on the spectrum is a Lanczos estimate with a margin; for a lumped mass, at most Gershgorin's bound.
     """
     nodal, d = nodal_pencil(pencil), pencil.space.dimension
     entries, sums = nodal.stiffness.coefficients, nodal.lumped_or_zero
