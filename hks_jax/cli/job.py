@@ -86,18 +86,18 @@ def result_of(
 
 
 def _warn_of_late(times: tuple[float, ...], pairs: hj.Eigenpairs, progress: Progress) -> None:
-    """Warn of times at which √t exceeds half the length of an interval with the same first positive eigenvalue λ₁."""
+    """Warn of times at which √t exceeds twice the value at the last of the `automatic_times`."""
     eigenvalues = np.asarray(pairs.eigenvalues)
     largest = LAST / float(eigenvalues[eigenvalues > 0].min(initial=np.inf))
     if late := [t for t in times if t > 4 * largest > 0]:
         progress.warn(
             f"{len(late)} of {len(times)} times are too large for the domain: at t > {4 * largest:.3g}, √t exceeds "
-            f"half the length of the domain, and the signature mainly shows its size. Choose times up to {largest:.3g}"
+            f"two thirds of the domain's length, and the signature shows mainly its size. Choose t ≤ {largest:.3g}"
         )
 
 
 def automatic_times(pairs: hj.Eigenpairs, n: int) -> tuple[float, ...]:
-    """Return n default times; at the last time, √t is about a quarter of the length of the domain."""
+    """Return n default times; at the last time, √t is about a third of the length of the domain."""
     return tuple(np.asarray(hj.default_times(pairs, n, math.exp(-LAST)), np.float64).tolist())
 
 

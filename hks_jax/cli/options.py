@@ -90,7 +90,7 @@ file FILE...
 [signature] the signature
 --times T...
     positive numbers, in s for --metric inverse; or auto, or auto:N for N times that suit the eigenvalues, the last when
-    √t is a quarter of the length of the domain (default auto:6). 'hks-jax info FILE' shows suitable times
+    √t is a third of the length of the domain (default auto:6). 'hks-jax info FILE' shows suitable times
 --normalisation raw|heat-trace|volume|flat = raw  normalisation of the signature
 --method spectral|spectrum-free|auto = spectral
     method: a sum over eigenpairs (default), a computation without eigenpairs, or a choice by t, k and the spacing. For

@@ -30,6 +30,7 @@ from hks_jax.io import TensorVolume, read_tensors, save_tensors
 from hks_jax.io.masks import names_beside, read_names
 from hks_jax.io.nifti import component_of
 from hks_jax.io.pairs import pairs_of
+from hks_jax.io.result import Result
 from hks_jax.io.tables import read_table, write_table
 from hks_jax.storage import claim
 
@@ -291,6 +292,7 @@ def test_a_study_is_a_bids_derivative(study, monkeypatch):
 
     # One result's table by itself is that of the study; on other voxels, labels are refused.
     atlas = study / "atlas_dseg.nii.gz"
+    np.testing.assert_array_equal(Result.read(out / "sub-01").values, Result.read(f"{stem}.npz").values)
     assert main(["stats", f"{stem}.npz", "--atlas", str(atlas), "-o", str(study / "r.tsv"), "-q"]) == 0
     assert (study / "r.tsv").read_text() == stem.with_name("sub-01_model-tensor_param-hks_regions.tsv").read_text()
     (row,) = (row for row in table(study / "r.tsv") if row["index"] == "17")
@@ -383,6 +385,7 @@ def test_a_subject_is_done_again_when_its_sidecar_changes(study):
         ("participant_id\tfile\nsub-1\ta\n1\tb\n", "two rows for sub-1"),
         ("participant_id\tfile\nsub-a_b\ta\n", "only letters and digits"),
         ("participant_id,file\n", "separated by tabs"),
+        ("participant_id file\nsub-1 a\n", "expected columns separated by tabs"),
     ],
 )
 def test_a_table_that_is_wrong_for_all_is_refused(tmp_path, capsys, text, words):
@@ -419,7 +422,7 @@ def test_common_times_suit_all_subjects():
     ranges = {"sub-01": (2.0, 50.0), "sub-02": (3.0, 80.0)}
     assert common_times(ranges, 3, "scanner") == (3.0, 12.2, 50.0)
     scaled = common_times(ranges, 2, "lambda1")
-    np.testing.assert_allclose(scaled, np.pi**2 / 4 * np.array([2 / 50, 1]), rtol=5e-3)
+    np.testing.assert_allclose(scaled, np.pi**2 / 9 * np.array([2 / 50, 1]), rtol=5e-3)
     with pytest.raises(ValueError, match="sub-02 resolves only t ≥ 4, and the size of sub-01 allows only t ≤ 3"):
         common_times({"sub-01": (2.0, 3.0), "sub-02": (4.0, 9.0)}, 3, "scanner")
 
@@ -435,7 +438,7 @@ def test_automatic_times_follow_the_metric_and_remain_those_of_the_study(study, 
     np.testing.assert_allclose(suitable(2.0, 8, "neumann"), suitable(1.0, 8, "neumann") / 2, rtol=1e-12)
     np.testing.assert_allclose(suitable(1.0, 8, "mean"), suitable(1.0, 4, "neumann"), rtol=1e-12)
     side = 54.0  # mm, of the largest axis, along which D is about 1.5e-3 mm²/s
-    assert abs(suitable(1.0, 8, "neumann")[1] / ((side / 2) ** 2 / 1.5e-3) - 1) < 0.3
+    assert abs(suitable(1.0, 8, "neumann")[1] / ((side / 3) ** 2 / 1.5e-3) - 1) < 0.3
     assert suitable(1.0, 1, "neumann")[0] > suitable(1.0, 8, "neumann")[0]
 
     def times(*more):

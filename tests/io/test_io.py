@@ -194,7 +194,7 @@ def test_frames_in_npz(tmp_path, tensors):
         ({"D": np.eye(2)}, "got the arrays D; expected 'tensors'"),
         ({"tensors": np.zeros((3, 4, 5))}, "expected \\(nx, ny, 2, 2\\) or \\(nx, ny, nz, 3, 3\\)"),
         ({"tensors": np.zeros((3, 4, 2, 2)), "spacing": [1, 2, 3]}, "spacing: got .* expected 2 finite numbers"),
-        ({"tensors": np.zeros((3, 4, 2, 2)), "mask": np.ones((4, 3))}, "mask: got shape \\(4, 3\\)"),
+        ({"tensors": np.zeros((3, 4, 2, 2)), "mask": np.ones((4, 3))}, "mask: got bool \\(4, 3\\)"),
         ({"tensors": np.zeros((3, 4, 2, 2)), "mask": np.full((3, 4), 0.5)}, "values other than 0 and 1"),
         ({"tensors": np.zeros((3, 4, 2, 2), complex)}, "dtype complex128; expected real numbers"),
     ],
