@@ -127,8 +127,8 @@ DEFAULT_K = {2: 200, 3: 100}
 """The default number of eigenpairs by dimension. It is smaller in 3D, where factorisations cost more."""
 RESOLVED = {2: 4.6, 3: 5.7}
 """The least λ_k·t, by dimension, at which at most 1 % of the signature lies beyond k pairs (`hks_jax.truncation`)."""
-LAST = (math.pi / 3) ** 2
-"""The largest value of λ₁·t, at which √t is a third of the length of an interval with the first eigenvalue λ₁. At
+LAST = (math.pi / 2) ** 2
+"""The largest value of λ₁·t, at which √t is half the length of an interval with the first eigenvalue λ₁. At
 larger times, the signature mainly shows the size of the domain."""
 COARSE = 6.0
 """The least ratio t/h² of time to squared node spacing at which the grid biases the signature by at most 1 %."""

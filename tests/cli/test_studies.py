@@ -422,7 +422,7 @@ def test_common_times_suit_all_subjects():
     ranges = {"sub-01": (2.0, 50.0), "sub-02": (3.0, 80.0)}
     assert common_times(ranges, 3, "scanner") == (3.0, 12.2, 50.0)
     scaled = common_times(ranges, 2, "lambda1")
-    np.testing.assert_allclose(scaled, np.pi**2 / 9 * np.array([2 / 50, 1]), rtol=5e-3)
+    np.testing.assert_allclose(scaled, np.pi**2 / 4 * np.array([2 / 50, 1]), rtol=5e-3)
     with pytest.raises(ValueError, match="sub-02 resolves only t ≥ 4, and the size of sub-01 allows only t ≤ 3"):
         common_times({"sub-01": (2.0, 3.0), "sub-02": (4.0, 9.0)}, 3, "scanner")
 
@@ -438,7 +438,7 @@ def test_automatic_times_follow_the_metric_and_remain_those_of_the_study(study, 
     np.testing.assert_allclose(suitable(2.0, 8, "neumann"), suitable(1.0, 8, "neumann") / 2, rtol=1e-12)
     np.testing.assert_allclose(suitable(1.0, 8, "mean"), suitable(1.0, 4, "neumann"), rtol=1e-12)
     side = 54.0  # mm, of the largest axis, along which D is about 1.5e-3 mm²/s
-    assert abs(suitable(1.0, 8, "neumann")[1] / ((side / 3) ** 2 / 1.5e-3) - 1) < 0.3
+    assert abs(suitable(1.0, 8, "neumann")[1] / ((side / 2) ** 2 / 1.5e-3) - 1) < 0.3
     assert suitable(1.0, 1, "neumann")[0] > suitable(1.0, 8, "neumann")[0]
 
     def times(*more):
