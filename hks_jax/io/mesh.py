@@ -48,7 +48,7 @@ def read_mesh(path: str | os.PathLike[str], *, clean: bool = False, in_space: bo
         clean: whether to clean the mesh. Cleaning removes vertices that are not finite and their cells, merges vertices
             within 1e-8 of the mesh's size, flips the longest edge of triangles of nearly zero height, removes cells of
             zero area or volume, duplicate cells and unused vertices, and reverses tetrahedra of negative orientation.
-            The vertices that cleaning keeps are renumbered in the order of the file. A warning lists all changes.
+            The kept vertices are renumbered in the order of the file. A warning lists what cleaning changed.
         in_space: whether to return the scanner coordinates that images have. FreeSurfer's coordinates are transformed
             by the axes and the centre (c_ras) of their volume, GIFTI's coordinates by the transformation in the file.
             Coordinates in all formats except FreeSurfer's and GIFTI stay unchanged.
@@ -133,7 +133,6 @@ def write(path: Path, arrays: Mapping[str, Float[np.ndarray, " V"]], mesh: Simpl
 
 
 def _load(path: str | os.PathLike[str], clean: bool, in_space: bool = False) -> tuple[Loaded, str]:
-    """Return the mesh in a file, cleaned if `clean`, and a text that lists the changes."""
     file = existing(path)
     name = file.name.lower()
     if name.endswith((".gii", ".gii.gz")):
