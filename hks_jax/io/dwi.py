@@ -161,7 +161,7 @@ def fit_dwi(
 # the sum of squared residuals of the signals, divided by the number of images minus the number of unknowns (Koay,
 # Chang, Pierpaoli and Basser 2007). The signal residual r of an image changes the unknowns by (XᵀW²X)⁻¹xwr, where x is
 # the image's row of the design matrix X, and w is its predicted signal. The residual r has the variance σ²(1 − h),
-# where h = w²xᵀ(XᵀW²X)⁻¹x is the image's leverage. The scaled residual r/√(1 − h) therefore has the variance σ² of the
+# where h = w²xᵀ(XᵀW²X)⁻¹x is the leverage of the image. So the scaled residual r/√(1 − h) has the variance σ² of the
 # noise (MacKinnon and White 1985, HC2). A sample of the noise has one random factor for each image, which preserves
 # correlations between voxels.
 def _covariance(

@@ -179,10 +179,10 @@ class Result:
 
     @property
     def z(self) -> Float[np.ndarray, "n_times *shape"] | None:
-        """The values minus a reference, in standard deviations of the noise; None if these are not known."""
+        """The values minus their flat-space value or their median, in standard deviations of the noise, if known."""
         if "deviation" not in self.arrays:
             return None
-        # The reference is the value in flat space (for the normalisations "raw" and "flat") or the median at each time.
+        # Normalisations except "raw" and "flat" have no known value in flat space, so the median at each time is used.
         flat = {"raw": 1 / self.flat_scale, "flat": 1.0}
         median = np.nanmedian(self.values, axis=tuple(range(1, self.values.ndim)), keepdims=True)
         return (self.values - flat.get(self.normalisation, median)) / self.arrays["deviation"]
