@@ -66,7 +66,7 @@ class Result:
         """Read a result from an npz that `save` or the command line wrote.
 
         Args:
-            path: the file, or the folder of a signature.
+            path: the npz, or a folder that ``hks-jax hks`` wrote.
             name: the name of the array. None means ``hks`` or, if the file has no such array, ``curvature``.
             over_times: whether the result must have an axis of times.
 
@@ -180,9 +180,10 @@ class Result:
 
     @property
     def z(self) -> Float[np.ndarray, "n_times *shape"] | None:
-        """The values minus the value of flat space (raw, flat) or their median (otherwise), in standard deviations."""
+        """The values minus their flat-space value or their median, in standard deviations of the noise, if known."""
         if "deviation" not in self.arrays:
             return None
+        # Normalisations except "raw" and "flat" have no known value in flat space, so the median at each time is used.
         flat = {"raw": 1 / self.flat_scale, "flat": 1.0}
         median = np.nanmedian(self.values, axis=tuple(range(1, self.values.ndim)), keepdims=True)
         return (self.values - flat.get(self.normalisation, median)) / self.arrays["deviation"]

@@ -388,7 +388,7 @@ def test_results_that_cannot_be_saved(tmp_path, volume):
         hj.io.save(tmp_path / "v.npz", np.zeros((5, 4, 6)), volume)
     with pytest.raises(ValueError, match=r"kind of file is unknown; expected \.nii\.gz, \.nii, \.nrrd, \.vti, \.npz"):
         hj.io.save(tmp_path / "v.txt", np.zeros(SHAPE), volume)
-    with pytest.raises(ValueError, match="NIfTI allows only times"):
+    with pytest.raises(ValueError, match="expected only times for NIfTI"):
         hj.io.save(tmp_path / "v.nii", np.zeros(SHAPE), volume, extra={"eigenvalues": [1]})
     with pytest.raises(ValueError, match="slice_axis: got 3 for 2 axes"):
         replace(volume.slice("z", 1), slice_axis=3)
