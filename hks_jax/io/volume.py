@@ -109,8 +109,13 @@ class TensorVolume:
         if mask is not None and not (isinstance(mask, np.ndarray) and mask.shape == shape and mask.dtype == bool):
             got, remedy = describe_array(mask), ". `read_mask` reads a file" * isinstance(mask, str | os.PathLike)
             raise ValueError(f"{where}mask: got {got}; expected a bool array of shape {shape}{remedy}")
-        if self.affine is not None and (self.affine.shape != (4, 4) or not np.isfinite(self.affine).all()):
-            raise ValueError(f"{where}affine: got shape {self.affine.shape}; expected finite numbers of shape (4, 4)")
+        if (affine := self.affine) is not None and (
+            affine.shape != (4, 4) or not np.isfinite(affine).all() or np.linalg.det(affine[:3, :3]) == 0
+        ):
+            raise ValueError(f"{where}affine: got {affine.tolist()}; expected an invertible matrix of shape (4, 4)")
+        for name, unit, known in (("length_unit", self.length_unit, "mm"), ("unit", self.unit, "mm²/s")):
+            if unit not in ("", known):
+                raise ValueError(f"{where}{name}: got {unit!r}; expected {known!r} or nothing. Convert the numbers")
         if self.slice_axis not in ((None,) if d == 3 else (None, 0, 1, 2)):
             raise ValueError(f"{where}slice_axis: got {self.slice_axis} for {d} axes; expected 0, 1 or 2 for a slice")
         if covariance is not None and covariance.shape != (*shape, *[d * (d + 1) // 2] * 2):

@@ -392,6 +392,10 @@ def test_results_that_cannot_be_saved(tmp_path, volume):
         hj.io.save(tmp_path / "v.nii", np.zeros(SHAPE), volume, extra={"eigenvalues": [1]})
     with pytest.raises(ValueError, match="slice_axis: got 3 for 2 axes"):
         replace(volume.slice("z", 1), slice_axis=3)
+    with pytest.raises(ValueError, match=r"affine: got \[\[0.0, .* expected an invertible matrix"):
+        replace(volume, affine=np.zeros((4, 4)))
+    with pytest.raises(ValueError, match="unit: got 'um2/ms'; expected 'mm²/s' or nothing"):
+        replace(volume, unit="um2/ms")
     with pytest.raises(ValueError, match="no 2×2 tensors"):
         hj.io.save_tensors(tmp_path / "v.nii", volume.slice("z", 1))
     assert list(tmp_path.iterdir()) == []
