@@ -133,6 +133,8 @@ def _on_mesh(args: argparse.Namespace, settings: Settings, progress: Progress) -
 
 def _check_mesh_options(args: argparse.Namespace) -> None:
     """Raise ValueError for options that only grids have, and for tensors without --metric."""
+    if args.others:
+        raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one mesh")
     if args.tensors and args.array:
         raise ValueError("--tensors, --array: got both; expected tensors either in a volume or at the mesh's vertices")
     of_grids = ["slice", "through", "view", "save_pairs", "components", "method"]
@@ -159,6 +161,11 @@ def _read_domain(args: argparse.Namespace, progress: Progress) -> tuple[SurfaceM
     vertices, cells = np.asarray(mesh.vertices).astype(args.dtype), mesh.triangulation.cells
     kind: Any = type(mesh)
     inside = None if args.inside is None else _inside(args.inside, len(vertices))
+    if inside is not None:
+        try:
+            kind(vertices, cells, mask=inside)
+        except ValueError as error:
+            raise ValueError(f"--inside: {str(error).removeprefix('mask: ')}") from error
     settings: Any = {"at": "vertices", "interpolation": args.interpolation, "mask": inside}
 
     def domain(tensors: Any) -> SurfaceMesh | TetMesh:
@@ -204,7 +211,7 @@ def _inside(path: Path, n_vertices: int) -> Bool[np.ndarray, " V"]:
     if path.suffix != ".label":
         return read_mask(path)
     numbers = optional("nibabel.freesurfer").read_label(path)
-    if numbers.size == 0 or numbers.max() >= n_vertices:
+    if numbers.size == 0 or numbers.min() < 0 or numbers.max() >= n_vertices:
         raise ValueError(f"--inside: got {numbers.size} vertices in {path}; expected indices 0 … {n_vertices - 1}")
     return np.isin(np.arange(n_vertices), numbers)
 

@@ -43,7 +43,10 @@ OPTIONS = f"@file {READING} @clean"
 def run(args: argparse.Namespace, progress: Progress) -> None:
     """Run the command."""
     progress.quiet, questions = True, list[str]()
-    if (result := _result_of(args.file)) is not None:
+    result = _result_of(args.file)
+    if args.others and (result is not None or is_mesh(args.file)):
+        raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one result or mesh")
+    if result is not None:
         description = _describe_result(result)
     elif is_mesh(args.file):
         description = {"file": str(args.file), **describe_mesh(args.file, read_mesh(args.file, clean=args.clean))}

@@ -281,7 +281,7 @@ def test_signature_of_a_solid_with_tensors_at_its_vertices(tmp_path, capsys):
     refused("--array: got 'D' with 9 components", "--array", "D", "--metric", "tensor", "--order", "vtk")
 
 
-def test_signature_of_a_surface_without_some_vertices(tmp_path):
+def test_signature_of_a_surface_without_some_vertices(tmp_path, capsys):
     meshio = pytest.importorskip("meshio")
     sphere = hj.examples.sphere_mesh(3)
     meshio.Mesh(np.asarray(sphere.vertices), [("triangle", sphere.faces)]).write(tmp_path / "s.vtk")
@@ -297,6 +297,13 @@ def test_signature_of_a_surface_without_some_vertices(tmp_path):
     picture = imread(tmp_path / "out" / "hks.png")[..., :3]
     assert np.ptp(picture[:, : picture.shape[1] // 2], axis=-1).max() > 0.3  # the surface has colours
     np.testing.assert_allclose(hj.io.Result.read(tmp_path / "out").values, expected, rtol=1e-5)
+    np.save(tmp_path / "none.npy", np.zeros(len(inside), bool))
+    for words, text in (
+        (["--inside", str(tmp_path / "none.npy")], "--inside: 0 of 92 vertices are inside"),
+        ([str(tmp_path / "s.vtk")], "FILE: got 2 files; expected one mesh"),
+    ):
+        assert main(["hks", str(tmp_path / "s.vtk"), *words, "-o", str(tmp_path / "out"), "-q"]) == 2
+        assert text in capsys.readouterr().err
     np.save(tmp_path / "labels.npy", 7 + (np.asarray(sphere.vertices)[:, 0] > 0))
     assert main(["explore", str(tmp_path / "out"), "--labels", str(tmp_path / "labels.npy"), "-q"]) == 0
 
