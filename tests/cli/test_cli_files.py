@@ -270,7 +270,7 @@ def test_signature_of_a_solid_with_tensors_at_its_vertices(tmp_path, capsys):
         assert main([*command, *more]) == 2
         assert message in capsys.readouterr().err
 
-    refused("--noise: this option needs tensors, which", "--noise", "0.1")
+    refused("--noise: this option needs tensors; saved", "--noise", "0.1")
     refused("--noise: got 'roughness'; expected a number", *of_tensors, "--noise", "roughness")
     refused("--metric: this option needs tensors, but without --array", "--metric", "tensor")
     refused("--interpolation: this option needs tensors", "--interpolation", "log-euclidean")
