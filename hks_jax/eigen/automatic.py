@@ -24,8 +24,8 @@ _SMALL = 1500
 # The choice is between shift-invert and a solver in JAX, called ``ours``: the Chebyshev filter on grids in 3D or in
 # float32, otherwise block Lanczos. A solver in JAX takes about five seconds to compile at any size. So for n·k up to 5
 # million, one solver is the fastest in the first call, and another solver in later calls. For each solver,
-# benchmarks/first_answer/automatic.py divides the time of the first call, and that of later calls, by the time of the
-# fastest solver. The choice minimises the larger of a solver's two time ratios, except for small volumes in float32. In
+# benchmarks/first_answer/automatic.py divides the time of its first call by the shortest first call of all solvers, and
+# likewise for later calls. The choice minimises the larger of the two ratios, except for small volumes in float32. In
 # float32, block Lanczos also factorises in float32; so it searches repeatedly, and leaves some pairs unconverged.
 _LARGE, _LARGE_IN_SINGLE = 800_000, 5_000_000
 """The least n·k (unknowns times pairs) for which a solver in JAX is chosen: in general, and for 2D grids in float32."""

@@ -207,8 +207,8 @@ def tangents_of(
     frame = with_transpose(onto_guards, onto_guards, force)
     if _solves(pencil, k, len(values)):
         # If every perturbation of K annihilates a null vector φᵢ, its force fᵢ is zero, and so is xᵢ. In reverse mode,
-        # a cotangent that may be nonzero replaces fᵢ, so xᵢ is set to zero for such null vectors. JAX needs products
-        # with K − λᵢM only for second derivatives, so the linear solve gets the identity instead of K − λᵢM.
+        # a cotangent that may be nonzero replaces fᵢ, so xᵢ is set to zero for such null vectors. JAX would
+        # use products with K − λᵢM only in second derivatives, which are not supported; the identity replaces them.
         free = np.arange(k)[:, None] >= pencil.n_fixed
         rhs = jnp.where(free, -force, 0)
         frame = frame + jnp.where(free, jax.lax.custom_linear_solve(lambda x: x, rhs, solve, symmetric=True), 0)

@@ -142,7 +142,7 @@ hourglass modes (alternating nodal values) have no energy."""
 # −Σ_{a<b} 2Aₐᵦkₐkᵦ (θₐ² + θᵦ²)/12, which is zero for a diagonal tensor. For a tensor that is not diagonal, no stencil
 # with 3^d couplings cancels the error of every plane wave. But the coefficient ν = 1/12 + δ of the stiffness cancels
 # the mean of the error over the heat kernel, in which the phases θ are normally distributed with a covariance
-# proportional to Sₐᵦ = hₐhᵦTₐᵦ. For the inverse B of the matrix S, Aₐᵦkₐkᵦ = Bₐᵦθₐθᵦ. Isserlis' theorem for
+# proportional to Sₐᵦ = hₐhᵦTₐᵦ. Since θₐ = hₐkₐ, Aₐᵦkₐkᵦ = Bₐᵦθₐθᵦ with B = S⁻¹. Isserlis' theorem for
 # expectations, E θₐθᵦθ_cθ_e = SₐᵦS_ce + Sₐ_cSᵦ_e + Sₐ_eSᵦ_c, gives the correction
 #
 #     δ = −(1/12) Σ_{a<b} 2Bₐᵦ E(θₐ³θᵦ + θₐθᵦ³) / (Σ_{a≠b} Bₐₐ E θₐ²θᵦ² + Σ_{a<b} Σ_{c≠a,b} 2Bₐᵦ E θₐθᵦθ_c²).

@@ -117,7 +117,7 @@ def unknowns_of(pencil: AnyPencil) -> int:
 def _require_resolved(wanted: int, n_dof: int, what: str, remedy: str) -> None:
     """Warn if more eigenpairs are needed than are accurate; raise ValueError if more than twice as many are needed.
 
-    Up to twice as many eigenpairs are allowed, because the initial metric may need more than the fitted metric.
+    An initial metric may need more eigenpairs than the fitted metric, and gets up to twice the usual number.
     """
     most = _most_pairs(n_dof)
     if wanted <= most:

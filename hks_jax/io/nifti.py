@@ -204,7 +204,7 @@ def read_components(paths: Sequence[str], order: str | None, frame: str | None) 
     for name, image in zip(names, images, strict=True):
         if image.shape != first.shape or math.prod(image.shape[3:]) != 1:
             raise ValueError(
-                f"{files[name]}: got shape {image.shape}; expected one component and one shape in all six files"
+                f"{files[name]}: got shape {image.shape}; expected six images of equal shape with one value per voxel"
             )
         if not np.allclose(affine_in_mm(files[name], image)[0], affine, rtol=1e-4, atol=1e-3):
             raise ValueError(f"{files[name]}: its affine differs from that of {files['xx']}; expected equal affines")

@@ -153,8 +153,8 @@ def within_groups(counts: Int[np.ndarray, " groups"]) -> Int[np.ndarray, " n"]:
 
 
 # Kőnig's theorem: for a maximum matching, consider alternating paths (an unmatched edge, a matched edge, …) from the
-# unmatched left vertices. The left vertices that no alternating path reaches and the right vertices that one reaches
-# form a vertex cover. Since this vertex cover has as many vertices as the matching has edges, no cover is smaller.
+# unmatched left vertices. The left vertices that these paths do not reach, and the right vertices that they reach, form
+# a vertex cover. Since this vertex cover has as many vertices as the matching has edges, no cover is smaller.
 def minimum_cover(left: Int[np.ndarray, " m"], right: Int[np.ndarray, " m"]) -> Int[np.ndarray, " s"]:
     """Return a minimum vertex cover of a bipartite graph, given the left and right ends of its edges."""
     lefts, row = np.unique(left, return_inverse=True)

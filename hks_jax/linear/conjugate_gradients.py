@@ -99,8 +99,8 @@ def conjugate_gradients(
             # Rounding destroys this orthogonality once an extreme Ritz pair has converged, and the iteration finds this
             # pair again (Paige 1971; Simon 1984). If eigenvalues decay over eight decades, the repetitions double the
             # number of steps. Reorthogonalisation takes less time than additional steps if products with the matrix are
-            # expensive and n is small. If the memory for residuals is full, the newest residual replaces the last one
-            # stored; the earliest residuals stay, because they prevent repetitions of the first converged pairs.
+            # expensive and n is small. If the memory for residuals is full, each new residual overwrites the last row.
+            # The first residuals stay, because they prevent repetitions of the first converged pairs.
             at, root = jnp.clip(state.steps, 0, len(kept[0]) - 1), jnp.sqrt(state.energy)
             kept = kept[0].at[at].set(state.r[:, 0] / root), kept[1].at[at].set(state.z[:, 0] / root)
             r = r - matmul(kept[0].T, products_with_columns(kept[1], r))

@@ -129,7 +129,7 @@ def spectrum(
         **kwargs: arguments of `Axes.plot` for the line of N(λ).
 
     Returns:
-        The lines of N(λ), of Weyl's law with the boundary term if `domain` is given, and of Weyl's law without it.
+        The curves of N(λ), of Weyl's law with both terms (if `domain` is given), and of its first term alone.
 
     Raises:
         ValueError: if the pairs do not belong to the domain.

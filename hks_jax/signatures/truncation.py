@@ -107,8 +107,8 @@ def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]
     median error was 1/3 to 3 times the estimate; for eigenvalue ratios of 30 on coarse grids it was 1/4 of the
     estimate. On meshes only the decreasing part of the error is estimated.
 
-    With a potential or an unknown null space, an exponent that follows from the mean of the eigenvalues replaces d/2 in
-    Weyl's law, if it is larger, and the discretisation error is NaN. The error is also NaN for unknown node spacing.
+    With a potential or an unknown null space, the exponent of Weyl's law is estimated from the mean of the eigenvalues,
+    if this gives more than d/2, and the discretisation error is NaN. The error is also NaN for unknown node spacing.
 
     Raises:
         ValueError: if times are not positive and finite, pairs lie in an interval, or the dimension is not known.

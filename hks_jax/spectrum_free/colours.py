@@ -1,4 +1,4 @@
-"""Colouring: the spacing of point sources and the degree of the Chebyshev expansion that a given tolerance needs."""
+"""The settings of the colouring method: from a tolerance follow the sources' spacing and the polynomial's degree."""
 
 import math
 from dataclasses import dataclass

@@ -73,7 +73,7 @@ def block_of(x: Rows, number: Array, block: int, shape: tuple[int, ...]) -> Floa
 
 
 def rayleigh_ritz(pencil: NodalPencil, slabs: Slabs | None, block: int, x: Rows) -> tuple[Values, Rows]:
-    """Return the Ritz values in ascending order and the M-orthonormal Ritz vectors as rows, on this device's slab."""
+    """Return ascending Ritz values and M-orthonormal Ritz vectors as rows; each device gets its slab of the vectors."""
     m, nodes = x.shape
     products = pencil.products()
 
