@@ -40,10 +40,10 @@ from hks_jax.eigen.eigenpairs import RESULTS as RESULTS
 from hks_jax.eigen.eigenpairs import Eigenpairs as Eigenpairs
 from hks_jax.eigen.filter.chebyshev_filter import ChebyshevFilter as ChebyshevFilter
 from hks_jax.eigen.filter.filtered_adjoint import FilteredAdjoint as FilteredAdjoint
-from hks_jax.eigen.host.host_adjoint import HostAdjoint as HostAdjoint
-from hks_jax.eigen.host.shift_invert import ShiftInvert as ShiftInvert
 from hks_jax.eigen.inertia import count_eigenvalues as count_eigenvalues
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos as BlockLanczos
+from hks_jax.eigen.shift_invert.host_adjoint import HostAdjoint as HostAdjoint
+from hks_jax.eigen.shift_invert.shift_invert import ShiftInvert as ShiftInvert
 from hks_jax.eigen.solver import Dense as Dense
 from hks_jax.eigen.solver import Eigensolver as Eigensolver
 from hks_jax.eigen.weyl import weyl_count as weyl_count
@@ -86,7 +86,7 @@ from hks_jax.signatures.times import default_times as default_times
 from hks_jax.signatures.truncation import Truncation as Truncation
 from hks_jax.signatures.truncation import truncation as truncation
 from hks_jax.signatures.truncation import truncation_map as truncation_map
-from hks_jax.spectrum_free.colours import Colouring as Colouring
+from hks_jax.spectrum_free.colouring import Colouring as Colouring
 from hks_jax.spectrum_free.heat_diagonal import colouring as colouring
 from hks_jax.spectrum_free.heat_diagonal import hks_spectrum_free as hks_spectrum_free
 from hks_jax.uncertainty import TensorNoise as TensorNoise

@@ -27,7 +27,7 @@ from machine import RESULTS, timed, write
 
 import hks_jax as hj
 from hks_jax.devices import Slabs, chebyshev_series
-from hks_jax.eigen.filter.rounds import FilterState, GridFilter
+from hks_jax.eigen.filter.subspace_iteration import FilterState, GridFilter
 from hks_jax.fem.nodal import nodal_pencil
 from hks_jax.fem.stencil import Stencil
 

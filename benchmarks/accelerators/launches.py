@@ -33,7 +33,7 @@ from compiled import Program, compile_for_chip, peak_bytes, unavailable  # noqa:
 from machine import RESULTS, write  # noqa: E402
 
 import hks_jax as hj  # noqa: E402
-from hks_jax.eigen.filter.rounds import FilterState, GridFilter  # noqa: E402
+from hks_jax.eigen.filter.subspace_iteration import FilterState, GridFilter  # noqa: E402
 from hks_jax.eigen.lanczos import recurrence, slicing  # noqa: E402
 from hks_jax.eigen.lanczos.block_lanczos import expected  # noqa: E402
 from hks_jax.eigen.lanczos.slicing_state import first_state, make_room  # noqa: E402

@@ -13,7 +13,7 @@ examples:
 import argparse
 import sys
 
-from hks_jax.cli.job import describe_input
+from hks_jax.cli.computation import describe_input
 from hks_jax.cli.options import READING
 from hks_jax.cli.outputs import Done
 from hks_jax.cli.progress import Progress

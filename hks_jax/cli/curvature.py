@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from hks_jax.cli.job import Settings, describe_input, field_of
+from hks_jax.cli.computation import Settings, describe_input, field_of
 from hks_jax.cli.options import READING
 from hks_jax.cli.outputs import Done, writing
 from hks_jax.cli.progress import Progress

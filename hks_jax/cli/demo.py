@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from hks_jax.cli.job import Settings, compute_pairs
+from hks_jax.cli.computation import Settings, compute_pairs
 from hks_jax.cli.noise import signature_of
 from hks_jax.cli.outputs import Done, write_outputs
+from hks_jax.cli.parsing import Times
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.values import Times
 from hks_jax.domain import examples
 from hks_jax.io import TensorVolume, erode, find_example_brain, fit_dwi
 from hks_jax.io.units import MM2_PER_S, median_mean_diffusivity

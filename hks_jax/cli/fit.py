@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from hks_jax import Grid, TensorField
-from hks_jax.cli.job import ComputationError, use_dtype
+from hks_jax.cli.computation import ComputationError, use_dtype
 from hks_jax.cli.options import FORMATS, refuse
 from hks_jax.cli.outputs import Done, writing
 from hks_jax.cli.progress import Progress

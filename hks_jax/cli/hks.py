@@ -32,8 +32,8 @@ from jaxtyping import Bool
 
 from hks_jax import SurfaceMesh, TensorNoise, TetMesh, assemble
 from hks_jax.cli import pairs as saved_pairs
+from hks_jax.cli.computation import Settings, compute_pairs, result_of, solve, use_dtype
 from hks_jax.cli.info import describe_mesh
-from hks_jax.cli.job import Settings, compute_pairs, result_of, solve, use_dtype
 from hks_jax.cli.noise import Noisy, check_noise, noise_of_volume, signature_of, with_error_bars
 from hks_jax.cli.options import READING, SOLVING, options_in, refuse
 from hks_jax.cli.outputs import PAIRS, Done, of_earlier, write_outputs

@@ -14,10 +14,10 @@ import numpy as np
 
 import hks_jax as hj
 from hks_jax.checks import require_count
-from hks_jax.cli.job import Settings, Solved, automatic_times, describe_input, result_of
+from hks_jax.cli.computation import Settings, Solved, automatic_times, describe_input, result_of
+from hks_jax.cli.parsing import Times
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read_volume
-from hks_jax.cli.values import Times
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result
 from hks_jax.io.volume import require_position

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from hks_jax.cli.values import KINDS
+from hks_jax.cli.parsing import KINDS
 from hks_jax.io.formats import SUFFIXES, WRITTEN
 from hks_jax.io.mesh import READ as MESHES
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from hks_jax import assemble
-from hks_jax.cli.job import Settings, Solved, field_of
+from hks_jax.cli.computation import Settings, Solved, field_of
 from hks_jax.cli.progress import Progress
 from hks_jax.io.arrays import place_of, volume_of
 from hks_jax.io.pairs import pairs_of, save_pairs

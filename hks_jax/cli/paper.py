@@ -10,7 +10,7 @@ examples:
 
 import argparse
 
-from hks_jax.cli.job import use_dtype
+from hks_jax.cli.computation import use_dtype
 from hks_jax.cli.outputs import Done, versions
 from hks_jax.cli.progress import Progress
 

@@ -16,9 +16,9 @@ import numpy as np
 
 from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import Done
+from hks_jax.cli.parsing import parse_times
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import sliced
-from hks_jax.cli.values import parse_times
 from hks_jax.io.result import Result
 
 OPTIONS = """

@@ -11,7 +11,7 @@ from hks_jax.cli.options import as_options, refuse
 from hks_jax.cli.progress import Progress
 from hks_jax.io import TensorVolume, erode, fit_dwi, positive_tensors, read_mask, read_tensors, repair_tensors
 from hks_jax.io.formats import format_of
-from hks_jax.io.questions import reviewed
+from hks_jax.io.plausibility import reviewed
 from hks_jax.io.repair import find_background, require_valid, without_background
 from hks_jax.io.units import unit_question
 

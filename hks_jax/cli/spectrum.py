@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from hks_jax.cli.job import Settings, compute_pairs, describe_input, describe_pairs
+from hks_jax.cli.computation import Settings, compute_pairs, describe_input, describe_pairs
 from hks_jax.cli.options import READING, SOLVING
 from hks_jax.cli.outputs import Done, writing
 from hks_jax.cli.progress import Progress

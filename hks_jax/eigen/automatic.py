@@ -8,8 +8,8 @@ import numpy as np
 from hks_jax.compilation import is_concrete_on_cpu
 from hks_jax.eigen.adjoints.factorised_adjoint import FactorisedAdjoint
 from hks_jax.eigen.filter.chebyshev_filter import ChebyshevFilter
-from hks_jax.eigen.host.shift_invert import ShiftInvert
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
+from hks_jax.eigen.shift_invert.shift_invert import ShiftInvert
 from hks_jax.eigen.solver import Dense, Eigensolver
 from hks_jax.fem.pencil import AnyPencil, Pencil
 from hks_jax.fem.stencil import StencilOperator

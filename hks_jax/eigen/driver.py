@@ -11,10 +11,10 @@ from hks_jax.eigen.automatic import choose_solver
 from hks_jax.eigen.derivative import of_simple
 from hks_jax.eigen.doubled import merge, solve_doubled
 from hks_jax.eigen.eigenpairs import RESULTS, SPARE, Eigenpairs, MultipletChoice, truncate
-from hks_jax.eigen.host.shift_invert import ShiftInvert
 from hks_jax.eigen.inertia import checked_pencil
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
 from hks_jax.eigen.one_pencil import Interval, checked_interval, solve_interval, solve_lowest, widened
+from hks_jax.eigen.shift_invert.shift_invert import ShiftInvert
 from hks_jax.eigen.solver import Dense, Eigensolver, Report, silent
 from hks_jax.fem.assembly import MassKind
 from hks_jax.fem.boundary import BoundarySpec

@@ -16,10 +16,10 @@ from hks_jax.compilation import is_concrete_on_cpu, jit_quickly, numpy_where_kno
 from hks_jax.eigen.adjoints.adjoint import Scalar
 from hks_jax.eigen.derivative import frame_of_chosen, solved
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.eigen.host.shift_invert import ShiftInvert, lower_bound
 from hks_jax.eigen.inertia import certain_count, count_below, locate, translated
 from hks_jax.eigen.lanczos.block_lanczos import SLICE, BlockLanczos, known_by_weyl
 from hks_jax.eigen.quality import allowed_residuals, indistinct, largest_of, measure_pairs, measured_on_host
+from hks_jax.eigen.shift_invert.shift_invert import ShiftInvert, lower_bound
 from hks_jax.eigen.solver import Dense, Eigensolver, Report
 from hks_jax.fem.nodal import on_all_nodes
 from hks_jax.fem.pencil import AnyPencil, Pencil

@@ -16,7 +16,7 @@ from hks_jax.checks import require_number
 from hks_jax.compilation import is_concrete_on_cpu
 from hks_jax.eigen.adjoints.adjoint import Adjoint
 from hks_jax.eigen.adjoints.factorised_adjoint import FactorisedAdjoint
-from hks_jax.eigen.host.matrices import host_matrices
+from hks_jax.eigen.shift_invert.matrices import host_matrices
 from hks_jax.linear.dense_eigh import pencil_eigh
 from hks_jax.linear.pencil import P, SymmetricPencil
 

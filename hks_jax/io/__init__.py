@@ -12,7 +12,7 @@ from hks_jax.io.mesh import read_mesh as read_mesh
 from hks_jax.io.mesh import read_mesh_arrays as read_mesh_arrays
 from hks_jax.io.pairs import load_pairs as load_pairs
 from hks_jax.io.pairs import save_pairs as save_pairs
-from hks_jax.io.questions import questions as questions
+from hks_jax.io.plausibility import questions as questions
 from hks_jax.io.repair import REPAIRS as REPAIRS
 from hks_jax.io.repair import find_background as find_background
 from hks_jax.io.repair import find_invalid as find_invalid

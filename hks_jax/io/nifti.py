@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from hks_jax.io.questions import OPEN_FRAME
+from hks_jax.io.plausibility import OPEN_FRAME
 from hks_jax.io.repair import require_symmetric
 from hks_jax.io.tables import write_json
 from hks_jax.io.tensor_order import FRAMES, ORDERS, matrices, pack

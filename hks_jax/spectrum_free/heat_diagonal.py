@@ -19,7 +19,7 @@ from hks_jax.fem.space import GridSpace
 from hks_jax.fem.sparse_input import pencil_of
 from hks_jax.linear.chebyshev import chebyshev_heat_coefficients
 from hks_jax.linear.dissection import dissect
-from hks_jax.spectrum_free.colours import Colouring
+from hks_jax.spectrum_free.colouring import Colouring
 from hks_jax.spectrum_free.plan import Method, choose_method, plan, require_grid
 from hks_jax.spectrum_free.probing import coloured_diagonal
 from hks_jax.spectrum_free.rational import selected_inversion

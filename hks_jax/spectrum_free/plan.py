@@ -14,7 +14,7 @@ from hks_jax.fem.pencil import AnyPencil, from_lower_bound
 from hks_jax.fem.space import GridSpace
 from hks_jax.linear.dissection import dissect
 from hks_jax.linear.selected_inversion import inversion_cost
-from hks_jax.spectrum_free.colours import Colouring, choose, mass_error, rounding_error
+from hks_jax.spectrum_free.colouring import Colouring, choose, mass_error, rounding_error
 from hks_jax.spectrum_free.rational import pole_pairs
 from hks_jax.spectrum_free.spectrum_bounds import Bounds, bounds, mass_bound
 from hks_jax.traced import is_traced

@@ -14,7 +14,7 @@ from hks_jax.fem.nodal import NodalPencil
 from hks_jax.linear.chebyshev import chebyshev_recurrence
 from hks_jax.linear.linear_map import first_order_only, with_transpose
 from hks_jax.linear.products import aligned
-from hks_jax.spectrum_free.colours import Colouring
+from hks_jax.spectrum_free.colouring import Colouring
 
 T = TypeVar("T")
 

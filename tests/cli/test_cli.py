@@ -21,8 +21,8 @@ from hks_jax import paper
 from hks_jax.cli import demo, fit, main
 from hks_jax.cli import outputs as outputs_module
 from hks_jax.cli.options import Option, options_in
+from hks_jax.cli.parsing import Times, parse_boundary, parse_times
 from hks_jax.cli.progress import Progress, bar, duration
-from hks_jax.cli.values import Times, parse_boundary, parse_times
 from hks_jax.eigen.solver import Status
 from hks_jax.fem.boundary import default_boundary
 from hks_jax.inverse.metric_fit import RESULTS

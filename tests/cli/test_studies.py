@@ -21,7 +21,7 @@ from annotations import unchecked
 
 import hks_jax as hj
 from hks_jax.cli import build_parser, main
-from hks_jax.cli.job import Settings
+from hks_jax.cli.computation import Settings
 from hks_jax.cli.progress import StudyProgress
 from hks_jax.cli.study.batch import common_times, suitable_range
 from hks_jax.cli.study.folder import Study

@@ -12,7 +12,7 @@ from dipy.reconst.dti import TensorModel, lower_triangular
 
 from hks_jax.cli import main
 from hks_jax.io import TensorVolume, fit_dwi, questions, read_tensors, save_tensors
-from hks_jax.io.questions import OPEN_FRAME, coherence
+from hks_jax.io.plausibility import OPEN_FRAME, coherence
 from hks_jax.io.tensor_order import pack
 
 SHAPE = (26, 24, 14)

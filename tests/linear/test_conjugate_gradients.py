@@ -7,8 +7,8 @@ import pytest
 
 import hks_jax as hj
 from hks_jax.eigen.adjoints.factorised_adjoint import FactorisedAdjoint
-from hks_jax.eigen.host.host_adjoint import _solve as solve_on_host
-from hks_jax.eigen.host.matrices import host_matrices
+from hks_jax.eigen.shift_invert.host_adjoint import _solve as solve_on_host
+from hks_jax.eigen.shift_invert.matrices import host_matrices
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
 
 

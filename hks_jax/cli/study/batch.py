@@ -39,16 +39,16 @@ from typing import Any
 
 import numpy as np
 
+from hks_jax.cli.computation import ComputationError, Settings
 from hks_jax.cli.info import describe
-from hks_jax.cli.job import ComputationError, Settings
 from hks_jax.cli.noise import check_noise, second_scan
 from hks_jax.cli.options import FILES, READING, SOLVING, defaults, flag, options_in, refuse
 from hks_jax.cli.outputs import Done, show
+from hks_jax.cli.parsing import Times
 from hks_jax.cli.progress import Progress, StudyProgress
 from hks_jax.cli.reading import read_volume, require_metric
 from hks_jax.cli.study.folder import MAP, Study, reading_options
 from hks_jax.cli.study.subjects import Subject, read_subjects
-from hks_jax.cli.values import Times
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import tuples
 from hks_jax.io.tables import read_json

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from hks_jax import __version__
-from hks_jax.cli.job import Settings
+from hks_jax.cli.computation import Settings
 from hks_jax.cli.noise import second_scan
 from hks_jax.cli.options import COLUMNS
+from hks_jax.cli.parsing import Times
 from hks_jax.cli.study.subjects import Subject
-from hks_jax.cli.values import Times
 from hks_jax.io.formats import format_of
 from hks_jax.io.masks import names_beside
 from hks_jax.io.nifti import is_nifti, siblings, sidecar_of

@@ -13,15 +13,15 @@ import jax
 import numpy as np
 
 from hks_jax.cli import INPUT_ERRORS
-from hks_jax.cli.job import ComputationError, Solved, compute_pairs
+from hks_jax.cli.computation import ComputationError, Solved, compute_pairs
 from hks_jax.cli.noise import noise_of_volume, signature_of
 from hks_jax.cli.pairs import are_of, read_pairs, write_pairs
+from hks_jax.cli.parsing import Times
 from hks_jax.cli.progress import StudyProgress
 from hks_jax.cli.reading import read_volume
 from hks_jax.cli.stats import region_table
 from hks_jax.cli.study.folder import MAP, PAIRS, REGIONS, Study
 from hks_jax.cli.study.subjects import Subject
-from hks_jax.cli.values import Times
 from hks_jax.io.formats import format_of
 from hks_jax.io.tables import write_table
 from hks_jax.plot import signature_panels

@@ -16,8 +16,8 @@ from hks_jax.eigen.adjoints.adjoint import Adjoint
 from hks_jax.eigen.filter.coarsening import coarsen
 from hks_jax.eigen.filter.filtered_adjoint import FilteredAdjoint
 from hks_jax.eigen.filter.polynomial import upper_end
-from hks_jax.eigen.filter.rounds import FilterState, GridFilter, Plan
 from hks_jax.eigen.filter.subspace import EVERYWHERE
+from hks_jax.eigen.filter.subspace_iteration import FilterState, GridFilter, Plan
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, Status, silent
 from hks_jax.fem.halo import checked_mesh

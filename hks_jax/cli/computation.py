@@ -11,8 +11,8 @@ import numpy as np
 
 import hks_jax as hj
 from hks_jax.cli.options import SOLVING, as_options, defaults
+from hks_jax.cli.parsing import Times, parse_times
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.values import Times, parse_times
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_checks import Interpolation, MetricChoice
 from hks_jax.eigen.automatic import choose_solver

@@ -15,8 +15,8 @@ from threadpoolctl import threadpool_limits
 
 from hks_jax.checks import require_count
 from hks_jax.eigen.adjoints.adjoint import Adjoint
-from hks_jax.eigen.host.host_adjoint import HostAdjoint
-from hks_jax.eigen.host.matrices import factorise_on_host, host_matrices, inertia_on_host
+from hks_jax.eigen.shift_invert.host_adjoint import HostAdjoint
+from hks_jax.eigen.shift_invert.matrices import factorise_on_host, host_matrices, inertia_on_host
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, Status, silent
 from hks_jax.fem.pencil import Pencil
 from hks_jax.traced import is_traced

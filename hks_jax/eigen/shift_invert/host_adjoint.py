@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from hks_jax.eigen.adjoints import adjoint as complement
 from hks_jax.eigen.adjoints.adjoint import Adjoint, Rows, Values, Vectors
-from hks_jax.eigen.host.matrices import factorise_on_host, host_matrices
+from hks_jax.eigen.shift_invert.matrices import factorise_on_host, host_matrices
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
 from hks_jax.traced import is_traced
