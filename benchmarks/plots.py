@@ -41,7 +41,7 @@ def eigensolvers(figure: Figure) -> None:
 
 
 def derivatives(figure: Figure) -> None:
-    """Relative error of the gradient against the perturbation of a symmetric field, for each rule."""
+    """Relative error of the gradient against the perturbation of a symmetric field, for each derivative rule."""
     axes = figure.subplots()
     rows = load("derivatives")["accuracy"]
     names = list(dict.fromkeys(name for row in rows for name in row["relative_errors"]))
@@ -57,7 +57,7 @@ def derivatives(figure: Figure) -> None:
 
 
 def solvers(figure: Figure) -> None:
-    """Time of the dense solver over that of shift-invert, against the number of unknowns."""
+    """Ratio of the dense solver's time to that of shift-invert, against the number of unknowns."""
     axes = figure.subplots()
     rows = rows_of("solvers")
     for colour, k in zip(COLOURS, sorted({row["k"] for row in rows}), strict=False):

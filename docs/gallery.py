@@ -93,7 +93,7 @@ def convolution() -> Figure:
 
 
 def degenerate() -> Figure:
-    """At degenerate points the eigenvalues are equal. Each mark shows the index of the eigenvector field."""
+    """At degenerate points the eigenvalues are equal. Each mark shows the index of the eigenvectors around a point."""
     grid = hj.Grid.from_bounds(-1, 1, (61, 61))
     z = grid.nodes[..., 0] + 1j * grid.nodes[..., 1]
     v = (z - 0.5) * (z + 0.4 - 0.3j) * np.conj(z + 0.1 + 0.5j) ** 2 * np.conj(z - 0.2 - 0.6j)
@@ -141,7 +141,7 @@ def weyl() -> Figure:
 
 
 def influence() -> Figure:
-    """The maps show the boundary's share of the signature. Contour lines mark 1 % and 10 %."""
+    """The maps show the boundary's share of the signature. Contour lines mark shares of 1 % and 10 %."""
     field = brain_like()
     times = np.array([0.4, 1.5, 6.0]) * 1e5
     values = hj.boundary_influence(field, times, 300)
@@ -153,7 +153,7 @@ def influence() -> Figure:
 
 
 def around_one() -> Figure:
-    """4πt·HKS is 1 where the metric is flat. The upper row has the effect of a mask's rim, the lower row does not."""
+    """4πt·HKS is 1 where the metric is flat. The upper row shows the effect of a mask's rim; the lower row lacks it."""
     field = brain_like()
     times = np.array([0.4, 1.5, 6.0]) * 1e5
     pairs = hj.eigenpairs(field, 600, "mean")
@@ -169,7 +169,7 @@ def around_one() -> Figure:
 
 
 def ball() -> Figure:
-    """In (4πt)^(3/2)·HKS of a ball, a natural rim hides two inclusions; the mean shows them and the rim's curvature."""
+    """In (4πt)^(3/2)·HKS of a ball, Neumann conditions hide two inclusions, which the boundary "mean" shows."""
     n = 24
     grid = hj.Grid((n, n, n), 2 / (n - 1), -1.0)
     x, y, z = np.moveaxis(grid.nodes, -1, 0)
@@ -192,7 +192,7 @@ def ball() -> Figure:
 
 
 def rim_errors() -> Figure:
-    """The curves show the error at the rim of flat domains for natural and Dirichlet conditions and their mean."""
+    """The curves show the error at the rim of flat domains for Neumann and Dirichlet signatures and for their mean."""
     n = 41
     x, y = np.meshgrid(*[np.linspace(-1, 1, n)] * 2, indexing="ij")
     radius = np.hypot(x, y)

@@ -45,7 +45,7 @@ def map_fields(function: Callable[[Any], Any], batch: Any, mesh: Mesh) -> Any:
     mesh = checked_mesh(mesh)
     lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(batch)}
     if len(lengths) != 1 or lengths & {(), (0,)}:
-        raise ValueError(f"batch: got leading axes of lengths {sorted(lengths)}; expected one length, at least 1")
+        raise ValueError(f"batch: got arrays of lengths {sorted(lengths)}; expected arrays of the same length n ≥ 1")
     return _map(function, batch, mesh)
 
 
@@ -73,7 +73,7 @@ def heat_columns(
 
     If x is D⁻¹ times a unit vector, the result is a column of the heat kernel. Use this function for fields that exceed
     the memory of one device. Each degree of the Chebyshev expansion takes one product with K; for this product,
-    neighbouring devices exchange one plane of nodes. All times use the same products.
+    neighbouring devices exchange one plane of nodes. The products with K are computed once for all times.
 
     Args:
         slabs: the partition of the grid.
@@ -86,7 +86,7 @@ def heat_columns(
             traced.
 
     Returns:
-        Values in the layout of the columns. ``slabs.join(result, 1)`` removes the padding.
+        The columns exp(−tD⁻¹K) x, in the layout of ``columns``. ``slabs.join(result, 1)`` removes the padding.
 
     Raises:
         ValueError: arrays are not from `Slabs.split`, times or tolerance are invalid, or arrays are traced without a
@@ -129,10 +129,11 @@ def chebyshev_series(
     top: Float[Array, ""],
     series: Float[Array, "m terms"],
 ) -> Float[Array, "m *padded b"]:
-    """Return Σₙ cₘₙ Tₙ(2D⁻¹K/top − 1) x for each column x, where c is the series and Tₙ are Chebyshev polynomials.
+    """Return the Chebyshev series Σₙ cₘₙ Tₙ(2D⁻¹K/λ − 1) x for each row m of coefficients c and each column x.
 
-    The number ``top`` is an upper bound of the spectrum of D⁻¹K. The series has at least two terms. K, D and the layout
-    of the arrays are as in `heat_columns`. The result is linear in the series and in the columns, and differentiable.
+    The matrix c is ``series``, with at least two columns, and Tₙ is the Chebyshev polynomial of degree n. The number
+    λ = ``top`` is an upper bound of the spectrum of D⁻¹K. The matrices K and D and the layout of the arrays are
+    as in `heat_columns`. The result is linear in the series and in the columns, and differentiable.
 
     Examples:
         >>> slabs = hj.devices.Slabs(jax.make_mesh((1,), ("devices",)), (9, 9), (False, False))
@@ -159,5 +160,4 @@ def chebyshev_series(
 
 
 def _inverse(lumped: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Return the inverse of the lumped mass, with 0 at nodes that are not free."""
     return jnp.where(lumped > 0, 1 / jnp.where(lumped > 0, lumped, 1), 0)

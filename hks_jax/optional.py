@@ -1,4 +1,4 @@
-"""Optional libraries, which are imported on first use. If one is not installed, the error states the remedy."""
+"""Optional libraries, which are imported on first use; if a library is missing, an error says how to install it."""
 
 import importlib
 from types import ModuleType
@@ -11,11 +11,11 @@ _LIBRARIES = {
     "meshio": ("reading and writing meshes", "meshio", "mesh"),
     "pyvista": ("rendering volumes", "PyVista", "pyvista"),
 }
-"""The purpose of each optional package, the library's name, and the extra that installs it."""
+"""For each optional module: the library's purpose, its name, and the extra of hks-jax that installs the library."""
 
 
 def optional(module: str) -> ModuleType:
-    """Import a module of an optional library, such as ``"dipy.reconst.dti"``; an ImportError states the remedy."""
+    """Import a module of an optional library, such as ``"dipy.reconst.dti"``; an ImportError says how to install it."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

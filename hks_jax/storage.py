@@ -54,8 +54,8 @@ def atomic_folder(path: str | os.PathLike[str], stale: Callable[[], Iterable[Pat
 
     Args:
         path: the folder.
-        stale: a function that returns the files of an earlier result. These files are removed before new files are
-            moved, so that two results are never mixed.
+        stale: a function that returns the files of an earlier result. These earlier files are removed before the new
+            files are moved, so that `path` never contains files of two results.
 
     Raises:
         NotADirectoryError: if `path` is a file.
@@ -94,9 +94,9 @@ def atomic_folder(path: str | os.PathLike[str], stale: Callable[[], Iterable[Pat
 def claim(path: str | os.PathLike[str]) -> Iterator[bool]:
     """Lock the file at `path`; yield True if the lock gives this process exclusive access to a piece of work.
 
-    At the end, the file is removed; its folder is removed too if no other files are in it. If the process dies, the
-    operating system releases the lock and the file remains, which shows that the work was begun. Windows and some
-    network drives have no such locks; there, every process gets access.
+    At the end, the file is removed, and so is its folder if it is empty. If the process dies, the operating system
+    releases the lock, but the file remains. An unlocked file thus shows that a process began the work and did not
+    finish it. On Windows and on some network drives, files cannot be locked, and every process gets access.
     """
     file = Path(path)
     held = _hold(file)

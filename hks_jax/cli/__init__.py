@@ -30,11 +30,11 @@ from hks_jax.cli.progress import Progress
 from hks_jax.cli.study import batch
 
 COMMANDS = (hks, spectrum, curvature, fit, batch, stats, plot, explore, info, convert, demo, paper)
-"""The modules of the commands. The docstring is the help text, `OPTIONS` lists options, and `run` runs the command."""
+"""A module for each command: its docstring is the help text, `OPTIONS` lists its options, and `run` runs it."""
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 
-# Users can correct these errors: wrong values, missing files, missing extras. Other errors mean a failed computation.
+# Errors that a user can correct: wrong values, missing files, missing extras. Any other error is a failed computation.
 INPUT_ERRORS = (ValueError, FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError, ImportError)
 
 
@@ -110,8 +110,8 @@ def run_and_exit() -> NoReturn:
 
 
 def _interrupt_again(unraisable: Any) -> None:
-    # Python discards exceptions in finalisers and in callbacks of the garbage collector, such as JAX's. The timer
-    # therefore repeats an interrupt that occurs there, after the end of the callback.
+    # Python discards an interrupt (Ctrl-C) within a finaliser or a callback of the garbage collector, such as JAX's.
+    # The timer raises the interrupt again after the callback has ended.
     if isinstance(unraisable.exc_value, KeyboardInterrupt):
         threading.Timer(0.05, _thread.interrupt_main).start()
     else:

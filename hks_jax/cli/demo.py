@@ -1,8 +1,8 @@
 """Compute and draw the signature of a brain slice.
 
 Fit diffusion tensors to a slice of a real brain and draw its heat kernel signature. The PyPI wheel mdt==1.2.7 contains
-the brain (install it with --no-deps), and the fit needs "hks-jax[dti]". Without them, or with --phantom, the command
-uses an analytic phantom instead.
+the brain (install it with --no-deps), and the fit needs "hks-jax[dti]". If the wheel or the extra is missing, or with
+--phantom, the command uses an analytic phantom.
 
 examples:
   hks-jax demo

@@ -1,7 +1,7 @@
 """Write a page to explore a signature in a browser.
 
 Write a page to explore the signature that 'hks-jax hks' has written to the folder OUT. The page is one HTML file that
-any browser opens without a network. It has sliders for t and the slice, maps of the signature and of the tensors,
+any browser opens without a network. The page has sliders for t and the slice, maps of the signature and of the tensors,
 curves over t at chosen points, the distances between a chosen point's curve and all other curves, and mean curves of
 regions. Curves can be saved as CSV, and surfaces can be rotated.
 
@@ -24,7 +24,7 @@ from hks_jax.io.result import Result, signature_file
 OPTIONS = """
 result RESULT  the folder OUT that 'hks-jax hks' wrote, or an .npz from there
 -o,--output PAGE  the page (default: explore.html in OUT)
---labels FILE  region numbers on the same voxels or at the vertices, with 0 for unlabelled (NIfTI, .npy)
+--labels FILE  region numbers on the same voxels or at the vertices, with 0 for unlabelled (NIfTI, MRtrix, NRRD or .npy)
 @names
 --title TEXT  the page's title (default: the name of the tensors' file)
 --unit TEXT  the unit of t (default: s for the metric D⁻¹ of tensors from --bval and --bvec, otherwise none)

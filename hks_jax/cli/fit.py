@@ -1,7 +1,8 @@
 """Find the metric that has a given signature.
 
 Find the metric that has a given heat kernel signature. TARGET is an npz that 'hks-jax hks' wrote without
-normalisation. It contains 'hks' (n_times, *shape), 'times', 'spacing', 'origin', and optionally 'mask' and 'affine'.
+normalisation. TARGET contains 'hks' (n_times, *shape), 'times', 'spacing', 'origin', and optionally 'mask' and
+'affine'.
 
 The command writes to the folder OUT: tensors.npz (the metric), fit.npz (its signature, and the loss at each step),
 fit.png (in two dimensions) and report.json. Ctrl-C ends the fit and writes the best metric found until then.
@@ -86,7 +87,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         if args.boundary is None:
             recorded = tuples(target.settings.get("boundary"))
             args.boundary = recorded or "neumann"
-            origin = "recorded in the target" if recorded else "the default, because the target records none"
+            origin = "recorded in the target" if recorded else "the default, because the target has none"
             progress.note(f"boundary {json.dumps(args.boundary)} ({origin})")
     for message in unreached_sides(grid.inside, args.boundary):
         progress.warn(message)
@@ -144,8 +145,8 @@ def _initial(args: argparse.Namespace, grid: Grid, progress: Progress) -> Tensor
         progress.warn(f"--init: got the spacing {volume.spacing}; using the spacing of the target, {grid.spacing}")
     if lacking := int((grid.inside & ~volume.inside).sum()):
         raise ValueError(
-            f"--init: got a mask without {lacking} of the target's {int(grid.inside.sum())} nodes; expected tensors at "
-            "all nodes. Restrict the target to the mask of --init"
+            f"--init: got no tensors at {lacking} of the target's {int(grid.inside.sum())} nodes; expected tensors at "
+            "all nodes of the target. Restrict the target to the mask of --init"
         )
     metric: Any = args.metric or "tensor"
     tensors = volume.tensors.astype(args.dtype)

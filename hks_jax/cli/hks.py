@@ -4,7 +4,7 @@ Compute the heat kernel signature of a field of diffusion tensors. FILE contains
 
   tensors                    of a volume; --metric is required, and --slice restricts the computation to a slice
   diffusion-weighted images  with --bval and --bvec, to which tensors are fitted
-  a mesh                     of triangles or tetrahedra, with the metric of space, or of tensors at its vertices
+  a mesh                     of triangles or tetrahedra, with the Euclidean metric, or of tensors at its vertices
                              (--array), or of tensors in a volume (--tensors)
   eigenpairs                 written by --save-pairs, for other times, or another normalisation or method
 
@@ -67,7 +67,7 @@ OPTIONS = f"""
 
 _OF_TENSORS = ("metric", "order", "interpolation")
 """Options that refer to tensors at the vertices of a mesh."""
-_NO_NOISE = "this option needs tensors, which eigenpairs and meshes with the metric of space do not have; leave it out"
+_NO_NOISE = "this option needs tensors; saved eigenpairs and meshes with the Euclidean metric have none. Leave it out"
 
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
@@ -96,7 +96,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         refuse(args, ("through",), "this option is for a volume; leave it out for a slice")
     if not saved:
         solved = compute_pairs(volume, settings, progress)
-    if args.save_pairs:  # before later steps, which may fail
+    if args.save_pairs:  # the eigenpairs are written first, because later steps may fail
         with progress.stage("writing", str(args.output / PAIRS)):
             for file in of_earlier(args.output, np.asarray(solved.pairs.eigenvalues), progress):
                 file.unlink(missing_ok=True)
@@ -133,13 +133,13 @@ def _check_mesh_options(args: argparse.Namespace) -> None:
     if args.tensors and args.array:
         raise ValueError("--tensors, --array: got both; expected tensors either in a volume or at the mesh's vertices")
     of_grids = ["slice", "through", "view", "save_pairs", "components", "method"]
-    if not args.tensors:  # with --tensors, these options refer to the volume
+    if not args.tensors:  # with --tensors, the options for reading refer to the volume
         of_grids += [o.name for o in options_in(READING) if o.name not in (*_OF_TENSORS, "array")]
     refuse(args, of_grids, "this option is for tensors on a grid; leave it out for a mesh")
     if args.boundary not in (None, *MESH_BOUNDARIES):
         raise ValueError(f"--boundary: got {args.boundary!r}; expected {', '.join(MESH_BOUNDARIES)} for a mesh")
     if not (args.array or args.tensors):
-        why = "this option needs tensors, but without --array and --tensors a mesh has the metric of space"
+        why = "this option needs tensors, but without --array and --tensors a mesh has the Euclidean metric"
         refuse(args, _OF_TENSORS, f"{why}. Pass --array or --tensors, or leave this option out")
         refuse(args, ("noise",), _NO_NOISE)
     elif args.metric is None:

@@ -163,14 +163,16 @@ def _lines(description: dict[str, Any]) -> list[str]:
         ]
         if description["without_element"]:
             lines.append(
-                f"                {description['without_element']} voxels inside are left out, because they belong to "
-                "no element; an element is a cube (in a slice a square) of voxels inside"
+                f"                {description['without_element']} voxels of the mask are left out, because they "
+                "belong to no element; an element is a cube (in a slice a square) of adjacent voxels of the mask"
             )
         lines.append(f"invalid         {bad} tensors are not positive definite")
         if "question" in description:
             lines.append(f"                {as_options(description['question'])}")
         elif bad > MANY * description["inside"]:
-            lines.append("                noise does not explain this number; for indefinite tensors, see --positive")
+            lines.append(
+                "                noise does not explain so many; for naturally indefinite tensors, see --positive"
+            )
         elif bad:
             lines[-1] += ": see --repair"
         if description["not_symmetric"]:
@@ -178,7 +180,7 @@ def _lines(description: dict[str, Any]) -> list[str]:
     in_mm, unit = description.get("length_unit") == "mm", description.get("unit", "")
     if in_mm and not unit:
         known = is_plausible(description.get("median_mean_diffusivity", 0.0))
-        unit = f"{MM2_PER_S} (not declared)" if known else "(unit not declared)"
+        unit = f"{MM2_PER_S} (assumed)" if known else "(unit not declared)"
     time = " s" if in_mm and unit.startswith(MM2_PER_S) else ""
     if "eigenvalues" in description:
         e = description["eigenvalues"]
@@ -193,7 +195,7 @@ def _lines(description: dict[str, Any]) -> list[str]:
         takes = f"k ≈ {s['k_for_least_time']}" if worth else "too many eigenpairs; see --method auto"
         of = time if name == "inverse" else ""
         lines.append(
-            f"metric {name:<8} t ≥ {s['least_time']:.3g}{of} for an error of 1 % from the spacing (needs {takes}); "
-            f"t ≥ {s['least_time_of_k']:.3g}{of} for k = {s['k']}; t ≤ {s['largest_time']:.3g}{of} from the size"
+            f"metric {name:<8} t ≥ {s['least_time']:.3g}{of} for a discretisation error of 1 % (needs {takes}); "
+            f"t ≥ {s['least_time_of_k']:.3g}{of} for k = {s['k']}; t ≤ {s['largest_time']:.3g}{of} by the domain's size"
         )
     return lines

@@ -21,7 +21,7 @@ from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result
 from hks_jax.io.units import median_mean_diffusivity
 from hks_jax.signatures.hks import HKSMethod, Normalisation
-from hks_jax.signatures.times import LAST, default_k
+from hks_jax.signatures.times import default_k
 
 
 class ComputationError(RuntimeError):
@@ -79,14 +79,31 @@ def result_of(
     """Compute the signature on a mesh, or on a volume whose mask is the domain; the report includes `described`."""
     with progress.stage("signature"):
         times = settings.times.explicit or automatic_times(pairs, settings.times.automatic)
+        if not settings.times.automatic:
+            _warn_of_late(times, pairs, progress)
         values, origin = _signature(pairs, times, settings)
     report = {"input": described, **_report(settings, pairs, times), **origin}
     return Result(place, values, np.asarray(times), np.asarray(pairs.eigenvalues), report)
 
 
+def _warn_of_late(times: tuple[float, ...], pairs: hj.Eigenpairs, progress: Progress) -> None:
+    """Warn of times at which heat fills the domain: for a box, √t then exceeds about 0.6 times its sides."""
+    t, d, volume, problems = np.asarray(times), pairs.space.dimension, pairs.pencil.volume, len(pairs.pencil.parts)
+    assert d is not None
+    assert volume is not None
+    heat = np.exp(-np.outer(t, pairs.eigenvalues)).sum(axis=1) / float(volume)  # the mean of the signature
+    late = t[heat * (4 * np.pi * t) ** (d / 2) > 1.5 * 2**d / min(problems, 2)]
+    if late.size:
+        shown = ", ".join(f"{s:.4g}" for s in late)
+        progress.warn(
+            f"{late.size} of {len(times)} times are too large for the domain: at t = {shown}, √t is more than half "
+            "of its size or thickness, which the signature then mainly shows. Choose smaller times"
+        )
+
+
 def automatic_times(pairs: hj.Eigenpairs, n: int) -> tuple[float, ...]:
-    """Return n default times; at the last time, √t is about half the length of the domain."""
-    return tuple(np.asarray(hj.default_times(pairs, n, math.exp(-LAST)), np.float64).tolist())
+    """Return n default times; at the last time, √t is about a third of the length of the domain."""
+    return tuple(np.asarray(hj.default_times(pairs, n, math.exp(-((math.pi / 3) ** 2))), np.float64).tolist())
 
 
 def field_of(volume: TensorVolume, grid: hj.Grid, settings: Settings) -> hj.TensorField:

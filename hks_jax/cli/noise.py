@@ -122,9 +122,9 @@ def _error_bars(
 ) -> tuple[hj.Uncertainty, np.ndarray, np.ndarray, tuple[float, ...]]:
     """Return error bars, the sampled noise (n_draws, n_times, *shape), the interior (n_times, *shape), and the times.
 
-    For the boundary ``"mean"``, the interior contains the nodes with little influence of the boundary, and is empty at
-    times with few such nodes. For other boundaries, it is the whole domain. Automatic times begin at the first time
-    with a sufficient signal-to-noise ratio.
+    For the boundary condition ``"mean"``, the interior contains the nodes at which the boundary has little influence;
+    it is empty at times with few such nodes. For other boundary conditions, the interior is the whole domain.
+    Automatic times begin at the first time with a sufficient signal-to-noise ratio.
     """
     wanted = settings.times.automatic
     times = settings.times.explicit or automatic_times(pairs, _CANDIDATES * wanted)

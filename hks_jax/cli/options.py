@@ -50,7 +50,7 @@ file FILE...
     700 um2/s (TORTOISE) or 7e-10 m2/s. With --bval, the b-values have the reciprocal unit
 --array NAME  name of the tensors' array in an npz or VTK file with several arrays
 --spacing H...  distance between nodes, for .npy and .npz files that do not contain it
---confidence C = 0.5  confidence above which voxels of NRRD's masked tensors are inside
+--confidence C = 0.5  confidence above which a voxel of NRRD's masked tensors belongs to the mask
 [invalid] tensors that are not positive definite: by default, they raise an error
 --repair HOW[:FLOOR]
     repair of a few tensors: clip raises their eigenvalues to FLOOR (default: 1 % of the median of mean eigenvalues),
@@ -90,7 +90,7 @@ file FILE...
 [signature] the signature
 --times T...
     positive numbers, in s for --metric inverse; or auto, or auto:N for N times that suit the eigenvalues, the last when
-    √t is half the length of the domain (default auto:6). 'hks-jax info FILE' shows suitable times
+    √t is a third of the length of the domain (default auto:6). 'hks-jax info FILE' shows suitable times
 --normalisation raw|heat-trace|volume|flat = raw  normalisation of the signature
 --method spectral|spectrum-free|auto = spectral
     method: a sum over eigenpairs (default), a computation without eigenpairs, or a choice by t, k and the spacing. For
@@ -104,7 +104,7 @@ file FILE...
     that noise may explain. Automatic times of a single subject begin at a sufficient signal-to-noise ratio
 --draws N = 8  number of noisy maps from which error bars are computed
 [atlas]
---atlas FILE  integer labels on the image's voxels, with 0 for unlabelled: NIfTI, or .npy of the image's shape
+--atlas FILE  integer labels on the image's voxels, with 0 for unlabelled (NIfTI, MRtrix, NRRD or .npy)
 [names]
 --names FILE
     names of the labels: a table with the columns index and name, or lines of a number and a name, such as FreeSurfer's

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hks_jax.cli.progress import Progress
-from hks_jax.io.result import Result, plain, signature_file
+from hks_jax.io.result import Result, plain
 from hks_jax.io.tables import write_json
 from hks_jax.storage import atomic_folder
 
@@ -70,9 +70,9 @@ def write_outputs(folder: Path, result: Result, progress: Progress, draw: Callab
 
 
 def of_earlier(folder: Path, eigenvalues: np.ndarray, progress: Progress) -> list[Path]:
-    """Return the files of an earlier signature in a folder, except eigenpairs with these eigenvalues."""
+    """Return the files of an earlier signature in a folder, without saved eigenpairs that have equal eigenvalues."""
     found, own, pairs = [], [], folder / PAIRS
-    if signature_file(folder).is_file():  # otherwise, another program wrote the files
+    if (folder / "hks.npz").is_file():  # without a signature, other programs wrote the files
         regions = ("regions.json", "regions.tsv") if (folder / "regions.json").is_file() else ()
         own = [*folder.glob("hks.*"), folder / REPORT]
         found = [*own, *(folder / name for name in ("explore.html", *regions) if (folder / name).is_file())]

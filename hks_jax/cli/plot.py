@@ -20,7 +20,6 @@ from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import sliced
 from hks_jax.cli.values import parse_times
 from hks_jax.io.result import Result
-from hks_jax.signatures.times import RESOLVED
 
 OPTIONS = """
 result RESULT  the result, as an .npz or the folder of a signature
@@ -33,7 +32,7 @@ result RESULT  the result, as an .npz or the folder of a signature
     range of the colours: own for each image (default) or shared by all images, at least 1 % of the values; or two
     numbers LOW,HIGH (write --range=LOW,HIGH if LOW is negative)
 --quantiles Q,Q = 0,1  quantiles of the values at the two ends of an own or shared range of colours
---cmap NAME = viridis  colour map of matplotlib
+--cmap NAME  colour map of matplotlib (default: viridis, or colours that diverge from 1 if 1 means flat space)
 --scaled  draw (4πt)^(d/2)·HKS, which is 1 for flat space (with --normalisation flat, this is always drawn)
 --unit TEXT  unit of t
 --title TEXT  title of the picture
@@ -51,7 +50,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
 
     from hks_jax.plot import new_figure, save_figure
 
-    if args.cmap not in colormaps:
+    if args.cmap not in (None, *colormaps):
         raise ValueError(f"--cmap: got {args.cmap!r}; expected a colour map of matplotlib, such as viridis")
     formats = sorted(new_figure(1, 1).canvas.get_supported_filetypes())
     if args.output.suffix.lstrip(".").lower() not in formats:
@@ -59,20 +58,16 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     result = Result.read(args.result, args.array)
     if args.scaled and not (result.times.size and result.normalisation in ("raw", "flat")):
         raise ValueError(
-            f"--scaled: got {args.result} with the normalisation {result.normalisation}; expected raw or flat, and "
-            "times. Leave this option out"
+            f"--scaled: got {args.result} with the normalisation {result.normalisation}; expected a result with "
+            "times and the normalisation raw or flat. Leave this option out"
         )
     chosen = _choose_times(result, args)
     result = replace(result, values=result.values[chosen], times=result.times[chosen[: result.times.size]])
-    flat = result.normalisation == "flat"
-    values = result.values * result.flat_scale if args.scaled and not flat else result.values
-    if args.points is None:
-        figure = _panels(replace(result, values=values), args)
-    else:  # hks_curves multiplies by the scale itself
-        raw = result.values / result.flat_scale if flat else result.values
-        figure = _curves(replace(result, values=raw), args, args.scaled or flat)
-    save_figure(figure, args.output, dpi=args.dpi)
-    ends = {"least": float(np.nanmin(values)), "greatest": float(np.nanmax(values))}
+    if args.scaled and result.normalisation == "raw":
+        settings = {**result.settings, "normalisation": "flat"}
+        result = replace(result, values=result.values * result.flat_scale, report={"settings": settings})
+    save_figure(_panels(result, args) if args.points is None else _curves(result, args), args.output, dpi=args.dpi)
+    ends = {"least": float(np.nanmin(result.values)), "greatest": float(np.nanmax(result.values))}
     summary = {"source": str(args.result), "times": result.times.tolist(), "values": ends}
     return Done([args.output], summary)
 
@@ -98,9 +93,10 @@ def _choose_times(result: Result, args: argparse.Namespace) -> np.ndarray:
 
 def _panels(result: Result, args: argparse.Namespace) -> Any:
     from hks_jax.plot import hks_panels, middle_node
-    from hks_jax.plot.signature import LEAST_RANGE, cropped, placed
+    from hks_jax.plot.signature import LEAST_RANGE, caption, cropped, placed, titles_of
 
-    values, volume, title = result.values, result.volume, args.title or ""
+    signature = result.name == "hks"
+    values, volume, title = result.values, result.volume, args.title or (caption(result) if signature else "")
     if volume.dimension == 3:
         axis, index = args.slice or ("z", middle_node(result.grid.inside)[2])
         volume = sliced(volume, axis, index)
@@ -113,36 +109,40 @@ def _panels(result: Result, args: argparse.Namespace) -> Any:
         raise ValueError(f"--slice: no value of {args.result} in this slice is finite; choose another slice")
     plane, box = cropped(volume, drawn)
     vmin, vmax = (None, None) if isinstance(args.range, str) else args.range
+    around_one = signature and result.normalisation == "flat" and args.cmap is None and vmin is None
+    titles = titles_of(result) if signature and not args.unit else None
     return hks_panels(
         np.where(drawn, values, np.nan)[:, *box],
         result.times if result.times.size else [0.0],
         plane,
-        titles=None if result.times.size else [args.array or args.result.stem],
+        titles=titles if result.times.size else [args.array or args.result.stem],
         unit=args.unit or "",
         shared_range=args.range == "shared",
-        cmap=args.cmap,
+        centre=1.0 if around_one else None,
         vmin=vmin,
         vmax=vmax,
         quantiles=args.quantiles,
         least_range=LEAST_RANGE,
         suptitle=title,
         orientation=placed(volume, box, args.view),
+        **({"cmap": args.cmap} if args.cmap else {}),
     )
 
 
-def _curves(result: Result, args: argparse.Namespace, scaled: bool) -> Any:
+def _curves(result: Result, args: argparse.Namespace) -> Any:
     from hks_jax.plot import hks_curves, new_figure
     from hks_jax.plot.signature import placed
 
-    values, grid, d = result.values, result.grid, result.dimension
+    grid, d, flat = result.grid, result.dimension, result.normalisation == "flat"
+    values = result.values / result.flat_scale if flat else result.values  # hks_curves multiplies by this scale
     orientation = placed(result.volume, None, "neurological")
     if orientation is not None:  # points are in the coordinates of the images' axes
         values, grid = orientation.array(values), orientation.grid(grid)
     if any(len(point) != d for point in args.points):
         raise ValueError(f"--points: got {args.points}; expected {d} coordinates per point")
-    style = {"scaled": scaled, "cmap": args.cmap, "unit": args.unit or ""}
-    if result.eigenvalues.size:
-        style["limit"] = RESOLVED[d] / float(result.eigenvalues[-1])
+    style: dict[str, Any] = {"scaled": flat, "cmap": args.cmap or "viridis", "unit": args.unit or result.unit}
+    if result.smallest_time:
+        style["limit"] = result.smallest_time
     figure = new_figure(5.4, 4.0)
     hks_curves(figure.subplots(), values, result.times, grid, args.points, **style)
     if args.title:

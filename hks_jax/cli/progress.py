@@ -150,8 +150,9 @@ class Progress:
 class StudyProgress(Progress):
     """Progress over many subjects: the number of finished subjects, and the estimated time for the others.
 
-    On a terminal, one line shows a bar and the stages of the current subject. Otherwise, a line is printed at the
-    beginning and at the end of each subject. Warnings begin with the subject's name; the subject's sidecar stores them.
+    On a terminal, one line shows a bar and the stages of the current subject. Elsewhere, such as in a log file, one
+    line is printed when a subject begins and one when it ends. A warning begins with the subject's name, and is stored
+    in the subject's sidecar.
     """
 
     _LINE_END = "\r\x1b[K"

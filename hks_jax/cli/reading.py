@@ -63,9 +63,9 @@ def read(args: argparse.Namespace, progress: Progress, ask: Callable[[str], None
         values = np.linalg.eigvalsh(volume.tensors[volume.inside])
         if clipped := int((values[:, 0] < 0.01 * np.median(values.mean(axis=-1))).sum()):
             progress.warn(
-                f"{clipped} tensors inside have an eigenvalue near zero, because DIPY clips fits that are not positive "
-                "definite. Distances in D⁻¹ are very large there. --erode 1 removes boundary voxels, and --repair "
-                "nearest:1e-4 replaces these tensors"
+                f"{clipped} tensors in the mask have an eigenvalue near zero, because DIPY clips fits that are not "
+                "positive definite. At such voxels, distances in the metric D⁻¹ are very large. --erode 1 removes "
+                "boundary voxels, and --repair nearest:1e-4 replaces the tensors"
             )
     return volume
 

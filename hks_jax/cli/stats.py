@@ -31,7 +31,7 @@ from hks_jax.signatures.regions import region_statistics
 OPTIONS = """
 result RESULT  the folder OUT that 'hks-jax hks' wrote, or an .npz from there
 -o,--output TABLE  the table (default: regions.tsv in OUT)
---atlas FILE!  integer labels on the image's voxels, with 0 for unlabelled: NIfTI, or .npy of the image's shape
+--atlas FILE!  integer labels on the image's voxels, with 0 for unlabelled (NIfTI, MRtrix, NRRD or .npy)
 @names
 """
 
@@ -90,7 +90,7 @@ def region_table(
     cells = {name: np.tile(of, n_regions) for name, of in by_time.items() if of is not None}
     cells |= {name: np.repeat(of, n_times) for name, of in by_region.items()}
     cells |= {"mean": regions.mean.T.ravel(), "std": regions.deviation.T.ravel(), "median": regions.median.T.ravel()}
-    if "noise_maps" in result.arrays:  # the error of a regional mean comes from means of noisy maps
+    if "noise_maps" in result.arrays:  # a regional mean's error is the root mean square of the noisy maps' means
         draws = [region_statistics(one, labels).mean for one in result.arrays["noise_maps"]]
         cells["error"] = np.sqrt(np.mean(np.square(draws), axis=0)).T.ravel()
     about = {name: of for name, of in _about(result, atlas, names).items() if name in cells or name[0].isupper()}
@@ -100,7 +100,7 @@ def region_table(
 
 
 def _about(result: Result, atlas: Path, names: Path | None) -> dict[str, Any]:
-    """Return the sidecar: descriptions of all columns in order and, with capital letters, their origin."""
+    """Return the sidecar: descriptions of the table's columns in order, and (capitalised) the origin of the table."""
     settings = result.settings
     flat = result.volume.dimension == 2 and result.volume.affine is None
     values = _SCALES.get(settings.get("normalisation", "raw"), "the heat kernel signature")
@@ -117,8 +117,8 @@ def _about(result: Result, atlas: Path, names: Path | None) -> dict[str, Any]:
         "lambda1_t": {"Description": "t times the first positive eigenvalue, equal for all subjects"},
         "t": {"Description": "time in (metric length)²; in s for the metric D⁻¹ with D in mm²/s", **unit},
         "mean": {"Description": f"mean over the region's voxels in the domain: {values}"},
-        "std": {"Description": "standard deviation over these voxels (the root of the mean square deviation)"},
-        "median": {"Description": "median over these voxels"},
+        "std": {"Description": "standard deviation over the same voxels (the root of the mean square deviation)"},
+        "median": {"Description": "median over the same voxels"},
         "error": {"Description": "standard deviation of the mean due to the noise of the tensors"},
         "GeneratedBy": {"Name": "hks-jax", "Version": __version__},
         "LabelMap": {"File": atlas.name, "SHA256": digest(atlas)},

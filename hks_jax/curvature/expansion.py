@@ -30,7 +30,7 @@ from hks_jax.domain.tensor_field import TensorField
 Coefficients: TypeAlias = list[Array]
 Pair: TypeAlias = tuple[taylor.Series, taylor.Series]
 HIGHEST_ORDER = {2: 3, 3: 2}
-"""The highest order that is implemented, by dimension."""
+"""The highest implemented order of the expansion in each dimension."""
 
 
 @nan_is_meant
@@ -52,18 +52,18 @@ def hks_expansion(
     McKean and Singer (1967) give u₂ = (5R² − 2|Ric|² + 2|Riem|² + 12∇²R)/360; in 3D, the curvature tensor Riem has
     |Riem|² = 4|Ric|² − R². The expansion ignores the boundary, and so holds at distances well above 3√t from it.
 
-    If the field was made from a function, JAX differentiates it, and the coefficients are exact. Otherwise the
-    coefficients come from finite differences of sixth order, which are one-sided near the sides of a grid and the rim
-    of a mask. Near sides and rims, the error of u₂ is of fourth order and the error of u₃ is of second order in the
-    node distance h. For the machine precision ε, the relative rounding error of u₃ is about ε(t/h²)³/5, and a hundred
-    times larger within eight nodes of a side or rim. In float32 keep t below 30 h², or the order below 3. The result is
-    NaN outside the mask, and where no stencil fits into the mask.
+    If the field was made from a function, JAX differentiates the function, and the coefficients are exact. For a field
+    of nodal tensors, the coefficients come from finite differences of sixth order, which are one-sided near the sides
+    of a grid and the rim of a mask. Near sides and rims, the error of u₂ is of fourth order and the error of u₃ is of
+    second order in the node distance h. For the machine precision ε, the relative rounding error of u₃ is about
+    ε(t/h²)³/5, and a hundred times larger within eight nodes of a side or rim. In float32, keep the times t below 30 h²
+    or `order` below 3. The result is NaN outside the mask, and where no stencil fits into the mask.
 
     Args:
         field: the metric, d = 2 or 3.
         times: (n_times,) positive times, in length².
-        order: the highest power of t in the brackets, at most 3 on a surface and 2 in three dimensions; None is the
-            maximum.
+        order: the highest power of t in the expansion, at most 3 on a surface and 2 in three dimensions; None means
+            this maximum.
         periodic: whether the axes are periodic; one value for all axes, or one per axis.
 
     Raises:
@@ -102,7 +102,7 @@ def _hks_expansion(
 
 
 def _of_surface(K: Array, laplacian_K: Any = 0, gradient_squared: Any = 0, bilaplacian_K: Any = 0) -> Coefficients:
-    """Return 1, u₁, u₂ and u₃. A coefficient is wrong if an invariant in its formula is left out."""
+    """Return the coefficients 1, u₁, u₂, u₃ on a surface; each is valid only if its formula's invariants are given."""
     return [
         jnp.ones_like(K),
         K / 3,
@@ -112,7 +112,7 @@ def _of_surface(K: Array, laplacian_K: Any = 0, gradient_squared: Any = 0, bilap
 
 
 def _of_volume(metric: Jet, curvature: Jet | None) -> Coefficients:
-    """Return 1, u₁ and, if the jet of the scalar curvature is given, u₂."""
+    """Return the coefficients 1 and u₁ in three dimensions, and u₂ if the jet of the scalar curvature is given."""
     R, ricci_squared = scalar_and_ricci_squared(metric)
     coefficients = [jnp.ones_like(R), R / 6]
     if curvature is not None:
@@ -121,7 +121,7 @@ def _of_volume(metric: Jet, curvature: Jet | None) -> Coefficients:
 
 
 def _exact(field: TensorField, order: int, wraps: tuple[bool, ...]) -> tuple[Coefficients, Bool[np.ndarray, "*shape"]]:
-    """Compute the coefficients up to the order from the metric's function; also return the nodes of the domain."""
+    """Compute the expansion's coefficients from the metric's function; also return the nodes of the domain."""
     metric, inside = metric_function(field), domain_nodes(field.grid, wraps)
 
     def of_surface(x: Array) -> Coefficients:
@@ -137,7 +137,7 @@ def _exact(field: TensorField, order: int, wraps: tuple[bool, ...]) -> tuple[Coe
 
 
 def _invariant_series(E: taylor.Series, F: taylor.Series, G: taylor.Series, order: int) -> tuple[taylor.Series, ...]:
-    """Return Taylor series of K and, if the order needs them, ∇²K, |∇K|² and ∇⁴K, for the metric ((E, F), (F, G))."""
+    """Return Taylor series of the curvature invariants that `_of_surface` needs, for the metric ((E, F), (F, G))."""
     add, times, d = taylor.add, taylor.product, taylor.derivative
     determinant = add(times(E, G), -times(F, F))
     over = taylor.reciprocal(determinant)
@@ -169,7 +169,7 @@ def _invariant_series(E: taylor.Series, F: taylor.Series, G: taylor.Series, orde
 
 
 def _nodal(field: TensorField, order: int, wraps: tuple[bool, ...]) -> tuple[Coefficients, Bool[np.ndarray, "*shape"]]:
-    """Compute the coefficients by nested finite differences; also return the nodes where all coefficients are known."""
+    """Compute the expansion's coefficients by nested finite differences; also return the nodes where all are known."""
     g, known = metric_jet(field, wraps)
     if field.grid.dimension == 3:
         R = None

@@ -29,8 +29,8 @@ from hks_jax.domain.tensor_field import TensorField
 def scalar_curvature(field: TensorField, periodic: bool | Sequence[bool] = False) -> Float[Array, "*shape"]:
     """Return the scalar curvature R of a metric at the nodes; on a surface R = 2K for the Gaussian curvature K.
 
-    If the field was made from a function, JAX differentiates it, and R is exact. Otherwise R comes from sixth-order
-    finite differences of the nodal tensors, and is NaN under the conditions that `gaussian_curvature` states.
+    If the field was made from a function, JAX differentiates the function, and R is exact. For nodal tensors, R comes
+    from sixth-order finite differences, and is NaN under the conditions that `gaussian_curvature` states.
 
     Args:
         field: the metric, d = 2 or 3.
@@ -50,9 +50,9 @@ def scalar_curvature(field: TensorField, periodic: bool | Sequence[bool] = False
 def gaussian_curvature(field: TensorField, periodic: bool | Sequence[bool] = False) -> Float[Array, "*shape"]:
     """Return the Gaussian curvature K of a two-dimensional metric at the nodes.
 
-    If the field was made from a function, JAX differentiates it, and K is exact. Otherwise K comes from sixth-order
-    finite differences of the nodal tensors. The differences are one-sided near the edges of the grid and the mask. K is
-    NaN outside the mask and where no stencil fits into it. A stencil is a row of 7 nodes, or 8 near an edge.
+    If the field was made from a function, JAX differentiates the function, and K is exact. For nodal tensors, K comes
+    from sixth-order finite differences, one-sided near the edges of the grid and the mask. K is NaN outside the mask
+    and where no stencil fits into the mask. A stencil is a row of 7 nodes, or 8 near an edge.
 
     Args:
         periodic: whether the axes are periodic, so that node n is node 0; one value for all axes, or one per axis.
@@ -84,13 +84,14 @@ _PLANES = {2: ((0, 1),), 3: ((1, 2), (2, 0), (0, 1))}
 
 
 def riemann(metric: Jet) -> Float[Array, "... p p"]:
-    """Return the curvature tensor R_abcd of a 2D or 3D metric, where the pairs ab and cd run over p coordinate planes:
+    """Return the curvature tensor R_abcd of a 2D or 3D metric g; rows are coordinate planes ab, columns are planes cd.
 
         R_abcd = ½(∂_b∂_c g_ad + ∂_a∂_d g_bc − ∂_a∂_c g_bd − ∂_b∂_d g_ac) + ⟨Γ_bc, Γ_ad⟩ − ⟨Γ_bd, Γ_ac⟩
 
-    The Γ are Christoffel symbols of the first kind (Landau and Lifshitz, The Classical Theory of Fields, §92). On a
-    surface the only plane is 12, and the formula is Brioschi's with its determinants expanded (Gray, Modern
-    Differential Geometry of Curves and Surfaces, §17.1). In three dimensions the planes are 23, 31 and 12.
+    The components of the covectors Γ_bc are Christoffel symbols of the first kind (Landau and Lifshitz, The Classical
+    Theory of Fields, §92). On a surface the only plane is 12, and the formula is Brioschi's with its determinants
+    expanded (Gray, Modern Differential Geometry of Curves and Surfaces, §17.1). In three dimensions the planes are 23,
+    31 and 12.
     """
     planes = _PLANES[metric.value.shape[-1]]
     hessian, symbols, inverse = metric.hessian, christoffel(metric), spd.inverse(metric.value)
@@ -113,8 +114,8 @@ def riemann(metric: Jet) -> Float[Array, "... p p"]:
 def einstein(metric: Jet) -> Float[Array, "... 3 3"]:
     """Return the Einstein tensor (Ric − ½Rg)ⁱʲ of a three-dimensional metric.
 
-    The Einstein tensor is the double dual of the curvature tensor R_abcd. Component ij is −R_abcd/|g|, where the
-    coordinate planes ab and cd are perpendicular to the axes i and j.
+    The Einstein tensor is the double dual of the curvature tensor R_abcd: component ij of the Einstein tensor is
+    −R_abcd/|g|, where the coordinate planes ab and cd are perpendicular to the axes i and j.
     """
     return -riemann(metric) / spd.determinant(metric.value)[..., None, None]
 

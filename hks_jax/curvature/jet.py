@@ -21,7 +21,7 @@ MINIMUM_NODES = 8
 
 @lru_cache
 def stencils(order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the stencils of sixth order for the derivative of the given order, 1 or 2, in order of preference.
+    """Return the sixth-order stencils of a first or second derivative: the centred one first, others by their shift.
 
     Row i of the offsets (n, 8) and of the weights (n, 8) is stencil i for unit spacing, padded with zeros. For the
     second derivative, a centred stencil of 7 nodes gains an order by symmetry; shifted stencils need 8 nodes.
@@ -34,7 +34,7 @@ def stencils(order: int) -> tuple[np.ndarray, np.ndarray]:
     weights = np.zeros((len(runs), MINIMUM_NODES))
     for row, run in enumerate(runs):
         for column, node in enumerate(run):
-            # The weight is the derivative at 0 of the node's Lagrange polynomial; products of small integers are exact.
+            # A node's weight is a derivative of its Lagrange polynomial at 0; the products of small integers are exact.
             others = run[run != node]
             offsets[row, column] = node
             weights[row, column] = factorial(order) * np.poly(others)[-1 - order] / np.prod(node - others)
@@ -56,7 +56,7 @@ def differentiate(
     offsets, weights = stencils(order)
     n, d = inside.shape[axis], inside.ndim
     along = [n if a == axis else 1 for a in range(d)]
-    # Without a mask all grid lines have the same stencils, and one line of indices suffices.
+    # Without a mask, all grid lines along the axis have the same stencils, which are chosen for one line.
     choice, valid = _choose(np.ones(along, dtype=bool) if inside.all() else inside, offsets, axis, wraps)
     expand = tuple(range(d, jnp.ndim(values)))
     rows = np.expand_dims(choice, expand)
@@ -91,7 +91,7 @@ _BATCH = 4096
 
 
 class Jet(NamedTuple):
-    """A quantity and its derivatives at one or many points; the indices of derivatives are last."""
+    """A jet: the value, gradient and Hessian of a quantity at one or many points; the derivatives' axes come last."""
 
     value: Float[Array, "..."]
     gradient: Float[Array, "... d"]
@@ -101,7 +101,7 @@ class Jet(NamedTuple):
 def function_jet(fn: Callable[[Array], Any], x: Float[Array, " d"]) -> Jet:
     """Return the jet of a function at a point."""
 
-    # The lower derivatives are auxiliary outputs; otherwise nested jets would trace `fn` 7 times per level.
+    # The value and the gradient are auxiliary outputs; otherwise each level of nested jets would trace `fn` 7 times.
     def value(y: Array) -> tuple[Any, Any]:
         f = fn(y)
         return f, f
@@ -150,7 +150,7 @@ def christoffel(metric: Jet) -> Float[Array, "... d d d"]:
 
 def inner(inverse: Float[Array, "... d d"], p: Float[Array, "... d"], q: Float[Array, "... d"]) -> Float[Array, "..."]:
     """Return ⟨p, q⟩ = gᵃᵇ pₐ qᵦ of two covectors."""
-    # XLA fuses these sums of products, but would call a library for each of many tiny matrix products.
+    # XLA fuses sums of products with other operations, but would call a library for each of many tiny matrix products.
     return jnp.sum(inverse * p[..., :, None] * q[..., None, :], axis=(-2, -1))
 
 
@@ -162,7 +162,7 @@ def metric_function(field: TensorField) -> Callable[[Array], Array]:
 
 
 def metric_jet(field: TensorField, wraps: tuple[bool, ...]) -> tuple[Jet, Bool[np.ndarray, "*shape"]]:
-    """Return the jets of a metric at the nodes, (*shape, d, d, …), and the nodes where the jets are known."""
+    """Return a metric and its derivatives at the nodes, and the nodes where the derivatives are known."""
     inside = domain_nodes(field.grid, wraps)
     if field.function is None:
         return nodal_jet(field.domain_tensors, field.grid, inside, wraps)
@@ -178,8 +178,8 @@ def domain_nodes(grid: Grid, wraps: tuple[bool, ...]) -> Bool[np.ndarray, "*shap
 def at_nodes(fn: Callable[[Array], Any], grid: Grid, inside: Bool[np.ndarray, "*shape"]) -> Any:
     """Evaluate a function of position at every node; each array in the result has the shape (*shape, …).
 
-    Nodes outside the domain get the value at a node inside, because the function may be undefined outside. Its NaN
-    would enter the gradients even if NaN were masked afterwards.
+    Nodes outside the domain get the function's value at a node inside. The function may be NaN outside, and NaN would
+    enter the gradients even if a mask removed it from the values.
     """
     flat = np.where(inside[..., None], grid.nodes, grid.nodes[inside][0]).reshape(-1, grid.dimension)
     # High derivatives have many intermediates per node; batches limit their memory and keep them in the cache.

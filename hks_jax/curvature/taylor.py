@@ -1,8 +1,8 @@
 """Truncated Taylor series in two variables.
 
-A series is the vector of its coefficients in the order 1, x, y, x², xy, y², …, by total degree. So a shorter vector is
-a truncation of the series, and operations on several series truncate all of them to the shortest one. Nested JAX
-derivatives would compute each mixed derivative for every order of the variables, and take several times as long.
+A series is the vector of its coefficients in the order 1, x, y, x², xy, y², …, sorted by total degree. Removing the
+last coefficients truncates the series. Operations on several series truncate all series to the shortest one. Nested JAX
+derivatives would compute mixed derivatives in every order of the variables, and take several times as long.
 """
 
 from collections.abc import Callable
@@ -20,9 +20,10 @@ Series = Float[Array, " _n_terms"]
 def expand(fn: Callable[[Array], Array], x: Float[Array, " 2"], degree: int) -> Float[Array, "*components n_terms"]:
     """Return the Taylor series of a function at a point, exact to rounding.
 
-    Derivatives along a line are cheap, because only one variable changes. The derivatives along degree + 1 lines
-    determine the mixed derivatives: derivative number k along (c, s) is k! Σⱼ cᵏ⁻ʲ sʲ fₖⱼ, where fₖⱼ is the coefficient
-    of xᵏ⁻ʲyʲ. For equidistant angles of the lines, the equations for fₖⱼ are well-conditioned.
+    Derivatives along a line are cheap, because only one variable changes. Derivatives along degree + 1 lines determine
+    the series: the k-th derivative along the direction (c, s), divided by k!, is Σⱼ cᵏ⁻ʲ sʲ fₖⱼ, where fₖⱼ is the
+    coefficient of xᵏ⁻ʲyʲ. For equidistant angles of the lines, the equations for the coefficients fₖⱼ are
+    well-conditioned.
     """
     angles = np.pi * np.arange(degree + 1) / (degree + 1)
     c, s = np.cos(angles)[:, None], np.sin(angles)[:, None]
@@ -46,7 +47,7 @@ def expand(fn: Callable[[Array], Array], x: Float[Array, " 2"], degree: int) -> 
 
 
 def _with_next(derivatives: Callable[[Array], tuple[Array, ...]]) -> Callable[[Array], tuple[Array, ...]]:
-    """Return the function that also returns the derivative of the last entry."""
+    """Return a function of t that returns the given derivatives, 0 to m, and also derivative m + 1."""
 
     def last(t: Array) -> tuple[Array, tuple[Array, ...]]:
         known = derivatives(t)
@@ -60,12 +61,12 @@ def _with_next(derivatives: Callable[[Array], tuple[Array, ...]]) -> Callable[[A
 
 
 def add(*terms: Series) -> Series:
-    """Return the sum."""
+    """Return the sum of several series."""
     return jnp.sum(jnp.stack([term[: min(a.size for a in terms)] for term in terms]), axis=0)
 
 
 def product(a: Series, b: Series) -> Series:
-    """Return the product."""
+    """Return the product of two series."""
     n = min(a.size, b.size)
     return jnp.einsum("i,j,ijk->k", a[:n], b[:n], jnp.asarray(_products(n), a.dtype), precision="highest")
 
@@ -79,7 +80,7 @@ def reciprocal(a: Series) -> Series:
 
 
 def derivative(a: Series, axis: int) -> Series:
-    """Return the derivative with respect to a variable, a series of one degree less."""
+    """Return the derivative of a series with respect to one variable; its degree is less by one."""
     exponents = _exponents(a.size)[:, axis]
     kept = np.flatnonzero(exponents)
     return a[kept] * jnp.asarray(exponents[kept], a.dtype)
@@ -87,13 +88,13 @@ def derivative(a: Series, axis: int) -> Series:
 
 @lru_cache
 def _exponents(n: int) -> Int[np.ndarray, "n 2"]:
-    """Return the powers of the two variables for n coefficients; xᵏ⁻ʲyʲ has the number k(k + 1)/2 + j."""
+    """Return the exponents of both variables for the first n coefficients; xᵏ⁻ʲyʲ has the index k(k + 1)/2 + j."""
     return np.array([(k - j, j) for k in range(n) for j in range(k + 1)][:n])
 
 
 @lru_cache
 def _products(n: int) -> Bool[np.ndarray, "n n n"]:
-    """Mark [i, j, k] if monomial i times monomial j is monomial k."""
+    """Return an array whose entry [i, j, k] is true if monomial i times monomial j is monomial k."""
     powers = _exponents(n)[:, None] + _exponents(n)
     degree = powers.sum(axis=-1)
     return (degree * (degree + 1) // 2 + powers[..., 1])[..., None] == np.arange(n)

@@ -41,7 +41,7 @@ def active_elements(mask: Bool[np.ndarray, "*shape"], periodic: tuple[bool, ...]
 
 
 def element_nodes(elements: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
-    """Mark the nodes of marked elements; if elements are numbered, return the greatest number at each node."""
+    """Return at each node the greatest value of the adjacent elements; the values are booleans or labels."""
     nodes = np.zeros([n + 1 for n in elements.shape], elements.dtype)
     for corner in _corners(elements.ndim):
         np.maximum(nodes[corner], elements, out=nodes[corner])
@@ -64,8 +64,8 @@ def label_nodes(mask: Bool[np.ndarray, "*shape"], periodic: tuple[bool, ...]) ->
     Returns the labels (0 outside, 1 … n inside) and their number n.
     """
     elements = active_elements(mask, periodic)
-    # Elements that share a node are connected, whereas two neighbouring nodes need not share an element. So elements
-    # are labelled first, and nodes take the labels of their elements. Nodes on periodic sides connect elements, too.
+    # Elements that share a node are connected, but two neighbouring nodes need not share an element. Therefore elements
+    # are labelled, and nodes take the labels of their elements. Labels that meet at periodic sides are merged.
     labels, count = scipy.ndimage.label(elements, structure=np.ones((3,) * mask.ndim, dtype=bool))
     nodes = element_nodes(labels, periodic)
     if any(periodic) and count > 1:

@@ -17,7 +17,8 @@ class DegeneratePoints(NamedTuple):
 
     Attributes:
         positions: (n, 2) coordinates.
-        indices: (n,) multiples of ½: the number of turns of the eigenvectors along a closed curve around the point.
+        indices: (n,) the topological index of each point, a multiple of ½: the number of turns of the eigenvectors
+            along a closed curve around the point.
     """
 
     positions: Float[np.ndarray, "n 2"]
@@ -27,17 +28,19 @@ class DegeneratePoints(NamedTuple):
 def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
     """Find the points of a 2D field where the two eigenvalues are equal, and the topological index of each.
 
-    For the tensor T, the vector (T₁₁ − T₂₂, 2T₁₂) vanishes at these points. This vector is interpolated bilinearly, and
-    turns twice as fast as the eigenvectors. A cell around which the vector turns has one zero, of index ½ (wedge) or −½
-    (trisector). Close zeros are merged into one point with the sum of their indices (Tricoche and others 2001).
+    The vector v = (T₁₁ − T₂₂, 2T₁₂) is zero at the degenerate points of a tensor field T, and turns twice as fast as
+    the eigenvectors of T. The components of v are interpolated bilinearly in each grid cell. If v makes a full turn
+    along the sides of a cell, the cell has one degenerate point, of index ½ (wedge) or −½ (trisector). Neighbouring
+    degenerate points are merged into one, whose index is the sum of their indices (Tricoche and others 2001).
 
-    Points of index 0, pairs of opposite index that are closer than `merge`, and points on the rim of the domain are not
-    found. If eigenvalues are equal on a curve or in a region off the rim, the centre is found unless the index is 0.
+    The function does not find degenerate points of index 0, two points of opposite index closer than `merge` cells, or
+    points on the rim of the domain. If the eigenvalues are equal on a curve or in a region that does not touch the rim,
+    the function finds the centre of the curve or region, unless its index is 0.
 
     Args:
         field: a 2D field. Cells with a node outside the mask are not part of the domain.
-        merge: zeros in cells that are at most `merge` cells apart along either axis count as one point. The least value
-            is 1, because a zero on an edge belongs to two cells.
+        merge: degenerate points in cells that are at most `merge` cells apart along either axis count as one point. The
+            smallest allowed value is 1, because a point on an edge belongs to two cells.
 
     Returns:
         The points, sorted by the first and then by the second coordinate.
@@ -72,7 +75,7 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
     graph = coo_matrix((np.ones(len(near)), near.T), shape=(len(cells),) * 2)
     count, cluster = connected_components(graph, directed=False)
     turns = winding[tuple(cells.T)]
-    # A zero on an edge or node belongs to several cells. The turns in each cell are arbitrary, but their sum is not.
+    # If the vector v is zero on an edge or node, its turns around each adjacent cell are arbitrary, but not their sum.
     index = np.bincount(cluster, turns, count) / 2
     settled = np.bincount(cluster, on_rim[tuple(cells.T)], count) == 0
     shared = crossed[tuple(cells.T)]
@@ -89,7 +92,7 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
 def _windings(
     v: Float[np.ndarray, "nx ny 2"], tiny: Float[np.ndarray, "nx ny"], active: Bool[np.ndarray, "mx my"]
 ) -> tuple[Int[np.ndarray, "mx my"], Bool[np.ndarray, "mx my"], Bool[np.ndarray, "mx my"]]:
-    """Return the turns of v around each cell; mark cells with a zero on an edge, and cells with a zero on the rim."""
+    """Return the turns of the vector v around each cell; mark cells with v = 0 on an edge, or on an edge in the rim."""
     angle = np.arctan2(v[..., 1], v[..., 0])
     zero = np.hypot(v[..., 0], v[..., 1]) <= tiny
     number = np.zeros(active.shape)
@@ -98,7 +101,7 @@ def _windings(
         first, second = _ends(v, axis)
         a, b = _ends(angle, axis)
         turn = np.mod(b - a + np.pi, 2 * np.pi) - np.pi
-        # The linear interpolant of v along the edge passes the origin at the distance |cross|/apart.
+        # The line through the vectors v at the two ends of an edge passes the origin at the distance |cross|/apart.
         apart = np.linalg.norm(second - first, axis=-1)
         cross = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
         opposite = np.sum(first * second, axis=-1) < 0
@@ -117,7 +120,6 @@ def _windings(
 
 
 def _ends(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values at the low and at the high ends of the edges (or sides of the cells) along an axis."""
     n = values.shape[axis]
     return values.take(range(n - 1), axis), values.take(range(1, n), axis)
 

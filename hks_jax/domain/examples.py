@@ -191,7 +191,7 @@ def figure3_fields(n: int) -> dict[str, TensorField]:
 
 
 def rotated(angle: Callable[[Point], Array], major: float, minor: float) -> Metric:
-    """Return the metric with eigenvalues ``major`` and ``minor``; the major eigenvector has the ``angle(u)`` to axis 0.
+    """Return a metric with constant eigenvalues; at the point u its major eigenvector has the ``angle(u)`` to axis 0.
 
     Examples:
         >>> metric = hj.examples.rotated(lambda u: jnp.pi / 2 + 0 * u[0], major=4.0, minor=1.0)
@@ -237,11 +237,10 @@ def figure4_fields(n: int, major: float = 4.0, minor: float = 1.0) -> dict[str, 
 def degenerate_point_field(index: float, n: int) -> TensorField:
     """Return a field with a degenerate point of the given index in the middle of n × n nodes of (−1, 1)² (Fig. 5).
 
-    The eigenvalues are 10 ± 3|u|, and the major eigenvector has the angle ``index``·θ, where ``index`` is a multiple of
-    ½ and θ is the polar angle: T = 10·I + 3|u| [[c, s], [s, −c]] with c = cos(2·index·θ) and s = sin(2·index·θ). If z =
-    u₁ ± iu₂ with the sign of the index, and m = |2·index|, then c + is = (z/|z|)ᵐ, so no angle is computed. For the
-    indices ±½ the field is smooth at the centre. For other indices the field has no derivative at the centre, where the
-    curvature is NaN.
+    At the point u with the polar angle θ, the tensor is T = 10·I + 3|u| [[c, s], [s, −c]], where c and s are the cosine
+    and the sine of 2·``index``·θ. The eigenvalues of T are 10 ± 3|u|. The major eigenvector has the angle ``index``·θ,
+    where ``index`` is a multiple of ½. If the index is ½ or −½, the field is smooth at the centre. If the index is
+    neither ½ nor −½, the field has no derivative at the centre, where the curvature is NaN.
 
     Examples:
         >>> hj.degenerate_points(hj.examples.degenerate_point_field(-0.5, 9)).indices
@@ -258,7 +257,7 @@ def degenerate_point_field(index: float, n: int) -> TensorField:
             squared = u @ u
             length, safe = jnp.sqrt(squared), jnp.sqrt(jnp.where(squared > 0, squared, 1))
             x, y = x / safe, y / safe
-        c, s = x, y
+        c, s = x, y  # the real and the imaginary part of a power of x + iy, so no angle is computed
         for _ in range(m - 1):
             c, s = x * c - y * s, x * s + y * c
         return 10 * jnp.eye(2) + 3 * length * jnp.stack([jnp.stack([c, s]), jnp.stack([s, -c])])

@@ -22,7 +22,7 @@ def _icosahedron() -> tuple[Float[np.ndarray, "12 3"], Int[np.ndarray, "20 3"]]:
 # one along each axis. The large simplex n ≥ x₁ ≥ … ≥ x_d ≥ 0 is the union of n^d of these simplices. Two large
 # simplices match at a common facet, because both cut it into triangles with edges parallel to the facet's edges.
 def _kuhn(n: int, dimension: int) -> tuple[Int[np.ndarray, "p corners"], Int[np.ndarray, "cells corners"]]:
-    """Subdivide a simplex into n^d cells; return n times the barycentric coordinates of the points, and the cells."""
+    """Subdivide a simplex into n^d cells; return the points, as barycentric coordinates times n, and the cells."""
     lattice = np.indices((n + 1,) * dimension).reshape(dimension, -1).T
     points = lattice[(np.diff(lattice, axis=1) <= 0).all(axis=1)]
     strides = (n + 1) ** np.arange(dimension)[::-1]
@@ -41,7 +41,7 @@ def _kuhn(n: int, dimension: int) -> tuple[Int[np.ndarray, "p corners"], Int[np.
 def _glued(
     simplices: Int[np.ndarray, "s corners"], n: int
 ) -> tuple[Int[np.ndarray, "V 13"], Int[np.ndarray, "cells corners"]]:
-    """Subdivide simplices whose corners are among the 12 vertices and the centre; return the same as `_kuhn`."""
+    """Subdivide simplices between the icosahedron's 12 vertices and centre; merge the points on common facets."""
     weights, cells = _kuhn(n, simplices.shape[1] - 1)
     shares = np.zeros((len(simplices), len(weights), _CENTRE + 1), np.int16)
     for i, simplex in enumerate(simplices):

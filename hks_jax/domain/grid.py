@@ -120,7 +120,7 @@ class Grid(ByKey):
 
     @cached_property
     def unit(self) -> "Grid":
-        """The grid with the same shape and mask, spacing 1 and origin 0, which determines sparsity patterns."""
+        """The grid with the same shape and mask, but with spacing 1 and origin 0."""
         unit = Grid(self.shape)
         unit._mask = self._mask
         return unit

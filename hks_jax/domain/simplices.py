@@ -18,7 +18,7 @@ _ON_EDGE = 1e-6
 
 
 class Words(NamedTuple):
-    """The words for simplices of one dimension in messages."""
+    """The words that messages use for triangles or for tetrahedra."""
 
     argument: str
     letter: str
@@ -126,7 +126,7 @@ def check_places(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulatio
             edge = triangulation.facet_vertices(crowded[:1])[0].tolist()
             warn_of_accuracy(
                 f"faces: {crowded.size} edges belong to three triangles or more (the first has the vertices {edge}): "
-                "the surface branches there, and heat flows into all branches. To avoid this, remove the inner sheets"
+                "heat flows into all branches of the surface there. To avoid this, keep at most two triangles per edge"
             )
         _warn_of_hanging(vertices, triangulation)
         return
@@ -161,7 +161,6 @@ def check_metric(metric: Float[np.ndarray, "n d d"], cells: Int[np.ndarray, "n c
 
 
 def _check_once(faces: Int[np.ndarray, "F 3"]) -> None:
-    """Raise ValueError if two triangles have the same vertices, in any order."""
     vertices = np.sort(faces, axis=1)
     order = np.lexsort(vertices.T[::-1])
     again = np.flatnonzero((vertices[order[1:]] == vertices[order[:-1]]).all(axis=1))
@@ -174,7 +173,7 @@ def _check_once(faces: Int[np.ndarray, "F 3"]) -> None:
 
 
 def _warn_of_hanging(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulation) -> None:
-    """Warn if boundary edges pass through a vertex. There the surface is torn, as its two sides differ in vertices."""
+    """Warn if a vertex lies between the ends of a boundary edge, so that the triangles on both sides do not connect."""
     edges = triangulation.facet_vertices(triangulation.boundary_facets)
     rim = np.unique(edges)
     if not rim.size:
@@ -195,5 +194,5 @@ def _warn_of_hanging(vertices: Float[np.ndarray, "V 3"], triangulation: Triangul
         warn_of_accuracy(
             f"faces: {np.unique(vertex[hanging]).size} vertices lie on edges that they do not belong to (the first is "
             f"vertex {vertex[first]}, on the edge of the vertices {edges[which[first]].tolist()}): the surface is torn "
-            "there, and no heat flows across. Split the triangle at that edge, so that both sides share their vertices"
+            "at these edges, and no heat flows across them. Split the triangle of each edge at the vertex on it"
         )

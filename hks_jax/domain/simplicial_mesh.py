@@ -65,15 +65,14 @@ class SimplicialMesh(eqx.Module):
     ) -> Mesh:
         """Return the mesh with a metric made of tensors D in space; a surface uses only their tangential parts.
 
-        The tangential part of D is its quadratic form on the plane of a triangle. For diffusion tensors the tangential
-        part describes diffusion within the surface. The choice of the metric g has no default (see
+        The tangential part of D is its quadratic form on the plane of a triangle. If D is a diffusion tensor, its
+        tangential part describes diffusion within the surface. The choice of the metric g has no default (see
         `TensorField.from_diffusion`): ``"tensor"``, g = D; ``"inverse"``, g = D⁻¹; ``"adjugate"``, g = |D| D⁻¹. On a
-        surface D stands for its tangential part. If D is the identity, g is the metric of space.
+        surface, D in these formulas is the tangential part. If D is the identity, g is the Euclidean metric.
 
-        If the tensors are given at vertices, each cell takes the mean of the tensors at its vertices, or with
-        ``"log-euclidean"`` the exponential of the mean of their logarithms. The mean is the interpolant at the centre
-        of the cell. The error of one tensor per cell is of second order, like the error of the elements. The metric is
-        differentiable with respect to tensors and vertices.
+        Tensors at vertices are interpolated to the centre of each cell: by the mean of the tensors at its vertices, or
+        with ``"log-euclidean"`` by the exponential of the mean of their logarithms. Using one tensor per cell causes an
+        error of second order, as the elements do. The metric is differentiable with respect to tensors and vertices.
 
         Args:
             vertices: positions (V, 3).
@@ -110,7 +109,7 @@ class SimplicialMesh(eqx.Module):
         return f"{type(self).__name__}(vertices {describe_array(self.vertices)}, {cells}, metric {metric})"
 
     def restrict(self, of_cells: Any) -> Any:
-        """Return the entries for the cells inside the mask, if the array (n, …) has entries for cells outside, too."""
+        """Remove the entries of cells outside the mask from an array (n, …), unless they are already removed."""
         if self._mask is None or np.shape(of_cells)[:1] != self._mask.value.shape:
             return of_cells
         return (np.asarray(of_cells) if isinstance(of_cells, list | tuple) else of_cells)[self._mask.value]
@@ -162,18 +161,18 @@ class SurfaceMesh(SimplicialMesh):
 
 
 class TetMesh(SimplicialMesh):
-    """A mesh of tetrahedra, with the metric of space, or with a given metric that is constant on each tetrahedron.
+    """A mesh of tetrahedra, with the Euclidean metric or with a given metric that is constant on each tetrahedron.
 
     A mesh is a pytree: its leaves are the vertex positions and the given metric, if any. The connectivity is static.
 
-    Tetrahedra must be positively oriented, (v₁ − v₀) × (v₂ − v₀) · (v₃ − v₀) > 0, as in VTK and Gmsh. So an inverted
-    tetrahedron is an error, for example after moving a vertex. Under `jit` an inverted tetrahedron gives NaN instead.
+    Tetrahedra must be positively oriented, (v₁ − v₀) × (v₂ − v₀) · (v₃ − v₀) > 0, as in VTK and Gmsh. An inverted
+    tetrahedron, for example after moving a vertex, raises an error, or gives NaN under `jit`.
 
     Args:
         vertices: positions (V, 3).
         cells: vertex indices (C, 4).
         metric: (C, 3, 3), the metric of each tetrahedron in the basis of its edges v₁ − v₀, v₂ − v₀ and v₃ − v₀, in
-            place of the metric of space. For tensors in the axes of space see `from_tensors`.
+            place of the Euclidean metric. For tensors with components along the coordinate axes see `from_tensors`.
         mask: bool, (C,) for the tetrahedra or (V,) for the vertices, as for `SurfaceMesh`.
 
     Raises:
@@ -198,11 +197,11 @@ class TetMesh(SimplicialMesh):
         return self.triangulation.cells
 
     def boundary(self) -> tuple[SurfaceMesh, Int[np.ndarray, " B"]]:
-        """Return the surface of the triangles that belong to only one tetrahedron, with the metric of space.
+        """Return the surface of the triangles that belong to only one tetrahedron, with the metric induced by space.
 
         Returns:
-            The surface, oriented outward, and the indices (B,) of its vertices in this mesh. If ``numbers`` are these
-            indices, values (…, V) on this mesh are ``values[..., numbers]`` on the surface.
+            The surface, oriented outward, and the indices (B,) of its vertices in this mesh. If ``numbers`` are the
+            indices, an array ``values`` (…, V) on this mesh is ``values[..., numbers]`` on the surface.
         """
         triangulation = self.triangulation
         numbers, faces = np.unique(triangulation.facet_vertices(triangulation.boundary_facets), return_inverse=True)
@@ -244,7 +243,6 @@ def _edges_of(xp: Any, vertices: Any, cells: Any) -> Any:
 
 @numpy_where_known()
 def _induced_metric(xp: Any, edges: Any) -> Any:
-    """Return the inner products of the edges of each cell."""
     return spd.nan_unless_positive(xp, matmul(edges.mT, edges))
 
 

@@ -69,7 +69,7 @@ def metric_of_diffusion(tensors: Any, metric: str) -> Any:
 def cholesky(tensors: Float[Array, "... d d"], negligible: float | None = None) -> Float[Array, "... d d"]:
     """Return the lower triangular L with T = LLᵀ; NaN for matrices that are not positive definite.
 
-    For positive semidefinite T, a pivot up to ``negligible`` times its entry Tⱼⱼ makes the column of the pivot zero.
+    For positive semidefinite T pass ``negligible``: column j of L is zero if its pivot is at most ``negligible`` · Tⱼⱼ.
     """
     factor = jnp.zeros_like(tensors)
     for j in range(tensors.shape[-1]):
@@ -94,7 +94,7 @@ def is_positive(t: Any) -> Any:
     return (t[..., 0, 0] > 0) & (determinant(t[..., :2, :2]) > 0) & (determinant(t) > 0)
 
 
-# A product with NaN, unlike `where(…)`, makes the derivatives NaN, too.
+# A product with NaN, unlike `where(…)`, makes the derivatives of invalid matrices NaN, too; `where(…)` makes them zero.
 def nan_unless(xp: Any, valid: Any, matrices: Any) -> Any:
     """Return the matrices (..., i, j) of JAX or NumPy, with NaN in place of matrices that are not ``valid``."""
     return matrices * xp.where(valid, 1, xp.nan).astype(matrices.dtype)[..., None, None]
@@ -108,15 +108,16 @@ def nan_unless_positive(xp: Any, tensors: Any) -> Any:
 positive_or_nan = numpy_where_known()(nan_unless_positive)
 
 
-# If tr S = 0, the Cayley–Hamilton theorem gives S² = qI (d = 2) or S³ = pS + |S| I (d = 3). So exp S is a
-# polynomial in S of degree d − 1, whose coefficients are entire functions of q, or of p and |S|. No eigenvalues are
-# needed, and derivatives of any order are smooth where eigenvalues coincide. Taylor's series gives the coefficients of
-# E = exp(S/2ⁿ) − I. Each of n squarings replaces E by 2E + E², which preserves the relative accuracy of E.
+# Let S be a matrix of trace zero. By the Cayley–Hamilton theorem S² = qI with a number q (d = 2), or S³ = pS + |S| I
+# with a number p (d = 3). So exp S is a polynomial in S of degree d − 1, whose coefficients are entire functions of the
+# number q, or of p and the determinant |S|. No eigenvalues are needed, and derivatives of any order are smooth where
+# eigenvalues coincide. Taylor's series gives the coefficients of the matrix E = exp(S/2ⁿ) − I. Replacing the matrix E
+# by 2E + E² doubles its exponent, and keeps the relative accuracy of E; n replacements give exp S − I.
 _SQUARINGS, _TERMS = 8, 20
 
 
 @jax.jit
-@jax.checkpoint  # so that reverse mode stores the matrices, not a hundred numbers per matrix
+@jax.checkpoint  # reverse mode stores only the given matrices, not a hundred intermediate results for each of them
 def exp(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
     """Return the exponential of symmetric matrices, d = 2 or 3."""
     d, tensors = tensors.shape[-1], symmetrise(tensors)
@@ -129,7 +130,7 @@ def exp(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
 
 
 def _exp_in_2d(deviator: Float[Array, "... 2 2"]) -> tuple[list[Array], list[Array]]:
-    """Return [S] and the coefficients of I and S in exp S − I, where S is the deviator, so that tr S = 0."""
+    """Return the list [S], and the coefficients of I and S in the polynomial exp S − I, for S of trace zero."""
     q = jnp.square(deviator[..., 0, 0]) + jnp.square(deviator[..., 0, 1])
     small = q / 4**_SQUARINGS
     a = b = jnp.zeros_like(q)
@@ -143,7 +144,7 @@ def _exp_in_2d(deviator: Float[Array, "... 2 2"]) -> tuple[list[Array], list[Arr
 
 
 def _exp_in_3d(deviator: Float[Array, "... 3 3"]) -> tuple[list[Array], list[Array]]:
-    """Return [S, S²] and the coefficients of I, S and S² in exp S − I, where S is the deviator, so that tr S = 0."""
+    """Return the list [S, S²], and the coefficients of I, S and S² in the polynomial exp S − I, for S of trace zero."""
     square = matmul(deviator, deviator)
     p, r = 0.5 * jnp.trace(square, axis1=-2, axis2=-1), determinant(deviator)
     small_p, small_r = p / 4**_SQUARINGS, r / 8**_SQUARINGS
@@ -167,8 +168,8 @@ def log(tensors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
     return _log_in_2d(symmetric) if tensors.shape[-1] == 2 else _log_by_eigenvalues(symmetric)
 
 
-# Let T = mI + S with tr S = 0 and S² = qI. Its eigenvalues are m ± √q, so that log T = ½ log|T| I + atanh(√q/m)/√q S,
-# and atanh(x)/x is a smooth function of x² = q/m².
+# Let the matrix T be mI + S with a number m and a matrix S of trace zero. Then S² = qI with a number q, and the
+# eigenvalues of T are m ± √q. So log T = ½ log|T| I + atanh(√q/m)/√q S, where atanh(x)/x is a smooth function of x².
 def _log_in_2d(tensors: Float[Array, "... 2 2"]) -> Float[Array, "... 2 2"]:
     eye = jnp.broadcast_to(jnp.eye(2, dtype=tensors.dtype), tensors.shape)
     mean = jnp.trace(tensors, axis1=-2, axis2=-1) / 2
@@ -181,7 +182,7 @@ def _log_in_2d(tensors: Float[Array, "... 2 2"]) -> Float[Array, "... 2 2"]:
     for n in range(12, -1, -1):
         series = series * jnp.where(small, square, 0) + 1 / (2 * n + 1)
     root = jnp.sqrt(jnp.where(small, 0.04, square))
-    # atanh x = log(1 + x) − ½ log(1 − x²), and 1 − x² is the scaled determinant, which is accurate near zero, too.
+    # For x = √q/m, atanh x is log(1 + x) − ½ log(1 − x²), where |T/m| = 1 − x² is accurate near zero, too.
     factor = jnp.where(small, series, (jnp.log1p(root) - half) / root)
     return (jnp.log(mean) + half)[..., None, None] * eye + factor[..., None, None] * deviator
 
@@ -192,8 +193,8 @@ def _log_by_eigenvalues(tensors: Float[Array, "... d d"]) -> Float[Array, "... d
     return _log_of_pairs(values, vectors)
 
 
-# The derivative of f(T) is V ([f]∘(Vᵀ dT V)) Vᵀ with the divided differences [f] of f (Daleckii and Krein 1965). The
-# divided differences are smooth where eigenvalues coincide, whereas the derivatives of eigenvectors are not.
+# The derivative of f(T) is V ([f]∘(Vᵀ dT V)) Vᵀ with the eigenvectors V of T and the divided differences [f] of f
+# (Daleckii and Krein 1965). Where eigenvalues coincide, [f] is smooth, whereas the derivatives of V are not.
 @_log_by_eigenvalues.defjvp
 def _log_by_eigenvalues_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     values, vectors = eigh(primals[0])

@@ -16,7 +16,7 @@ MetricChoice = Literal["tensor", "inverse", "adjugate"]
 Interpolation = Literal["linear", "log-euclidean"]
 
 MANY = 0.05
-"""The largest fraction of invalid tensors for which noise at the rim of a mask is a plausible cause."""
+"""The largest fraction of the tensors that noise at the rim of a mask plausibly makes invalid."""
 
 
 def check_metric_choice(metric: str | None) -> None:
@@ -38,7 +38,8 @@ def checked_interpolation(interpolation: Any) -> Interpolation:
 def require_grid(grid: Any) -> None:
     """Raise TypeError for anything that is not a grid."""
     if not isinstance(grid, Grid):
-        raise TypeError(f"grid: got {type(grid).__name__}; expected hks_jax.Grid")
+        remedy = ". Pass volume.grid() of a volume" * hasattr(grid, "grid")
+        raise TypeError(f"grid: got {type(grid).__name__}; expected hks_jax.Grid{remedy}")
 
 
 def tensors_on(grid: Any, name: str, tensors: Any) -> Float[Array, "*shape d d"]:
@@ -55,7 +56,7 @@ def require_spd(
 ) -> None:
     """Raise ValueError unless the tensors inside the mask are finite, symmetric and positive definite.
 
-    `place` is the word for the location of a tensor in messages: ``"node"`` on grids, ``"vertex"``, …
+    Messages call the location of a tensor by the word `place`: ``"node"`` on grids, ``"vertex"`` or others on meshes.
     """
     require_finite_symmetric(name, tensors, inside, place)
     bad = inside & ~spd.is_spd(tensors)
@@ -64,8 +65,8 @@ def require_spd(
         of_grids = f"{_MASK}, or raise their eigenvalues (hks_jax.io.repair_tensors)"
         if bad.sum() > MANY * inside.sum():
             of_grids = (
-                "Noise does not explain this number. If the tensors are indefinite by nature, such as stress, make "
-                f"a metric by hks_jax.TensorField.from_indefinite. {_MASK}, if they are outside the domain"
+                "Noise rarely makes so many tensors indefinite. If they are indefinite by nature, as stress is, make a "
+                f"metric by hks_jax.TensorField.from_indefinite. {_MASK}, if they are outside the domain"
             )
         refuse(name, bad, inside, place, what, of_grids if place == "node" else "Raise their eigenvalues")
 
@@ -125,7 +126,7 @@ def right_cauchy_green(name: str, grid: Grid, F: Any) -> Float[Array, "*shape d 
         )
     if m == d and not is_traced(gradients):
         known = np.asarray(gradients, np.float64)
-        finite = grid.inside & np.isfinite(known).all(axis=(-2, -1))  # the check of the metric finds NaN
+        finite = grid.inside & np.isfinite(known).all(axis=(-2, -1))  # `require_spd` will find NaN in the metric
         determinants = np.linalg.det(np.where(finite[..., None, None], known, np.eye(d)))
         bad = finite & (determinants <= 0)
         if bad.any():
@@ -144,12 +145,12 @@ PositiveMap = Literal["exp", "shift"]
 
 MAPS: dict[str, str] = {
     "exp": "exp(S/s) with a scale s of your choice",
-    "shift": "S + c·I with c above minus the least eigenvalue",
+    "shift": "S + c·I with a shift c that makes it positive definite",
 }
-"""The description of each map in messages."""
+"""How messages describe each map from indefinite tensors S to a metric."""
 
 NUMBERS = {"exp": "scale", "shift": "shift"}
-"""What `number` means for each map."""
+"""The meaning of the argument `number` for each map from indefinite tensors to a metric."""
 
 
 def positive_map(
@@ -160,7 +161,7 @@ def positive_map(
     inside: Bool[np.ndarray, "*shape"],
     place: str = "node",
 ) -> Float[Array, "*shape d d"]:
-    """Return exp(S/s) or S + c·I for symmetric tensors S; the number is s or c. Outside the mask S is the identity.
+    """Return exp(S/s) or S + c·I, where `number` is s or c; outside the mask the identity replaces the tensor S.
 
     Raises:
         ValueError: an unknown map; NaN, infinite or unsymmetric tensors; an invalid scale or shift; a singular result.

@@ -39,9 +39,9 @@ class TensorField(eqx.Module):
         tensors: (*shape, d, d), symmetric positive definite inside the mask; ``tensors[i, j, 0, 1]`` is T₁₂ at node
             (i, j). Units: (length / coordinate unit)². Values outside the mask are ignored.
         interpolation: the interpolation between the nodes. With ``"linear"`` the components are multilinear, as in
-            Zobel, Reininghaus and Hotz; if tensors rotate, the determinant is larger between the nodes. With
-            ``"log-euclidean"`` the components of the logarithm are multilinear (Arsigny, Fillard, Pennec and Ayache).
-            Then the logarithm of the determinant is multilinear, and T⁻¹ is interpolated in the same way as T.
+            Zobel, Reininghaus and Hotz; if the eigenvectors turn, the determinant is larger between the nodes. With
+            ``"log-euclidean"`` the components of log T are multilinear (Arsigny, Fillard, Pennec and Ayache), as is the
+            logarithm of the determinant, and T⁻¹ is interpolated in the same way as T.
 
     Raises:
         ValueError: a wrong shape; tensors that are NaN, infinite, unsymmetric or not positive definite inside the mask
@@ -108,20 +108,20 @@ class TensorField(eqx.Module):
 
         There is no default for ``metric``, because several conventions are in use:
 
-        - ``"inverse"``: g = D⁻¹, whose distances are the distances of diffusion with diffusivity D; t has units of
-          time;
+        - ``"inverse"``: g = D⁻¹, whose distances are the distances of diffusion with diffusivity D; the times of
+          signatures have units of time;
         - ``"tensor"``: g = D, as in Zobel, Reininghaus and Hotz;
         - ``"adjugate"``: g = |D| D⁻¹, the inverse scaled so that |g| = |D|^(d−1).
 
-        The metric g is interpolated. With ``"log-euclidean"``, interpolation of D would give the same metric.
+        The field interpolates g between the nodes. With ``"log-euclidean"``, interpolating D would give the same g.
 
         Examples:
             >>> metric = hj.TensorField.from_diffusion(field.grid, field.tensors, metric="inverse")
             >>> print(jnp.linalg.det(metric.tensors[4, 4]).round(3))  # 1/|D|
             0.25
         """
-        check_metric_choice(metric)
         tensors = spd.symmetrise(_checked_tensors(name, grid, D))
+        check_metric_choice(metric)
         if metric == "tensor":
             return cls._checked(grid, interpolation, tensors)
         return cls(grid, _metric_of_diffusion(spd.identity_outside(tensors, grid.inside), metric), interpolation)
@@ -133,10 +133,10 @@ class TensorField(eqx.Module):
         """Return the metric C = FᵀF of a deformation gradient F (*shape, d, d), the right Cauchy–Green tensor.
 
         ``F[..., i, j]`` is ∂yᵢ/∂xⱼ, where y is the position to which the point x moves, or would move without
-        constraints. The metric measures lengths after the deformation. Later rotations do not change the metric.
+        constraints. The metric measures lengths after the deformation, and is invariant to rotations that follow it.
 
-        If F is the gradient of a map, the metric is flat, and the signature is the signature of the deformed body. If F
-        describes growth, plastic or elastic strain, the curvature of C is the strain's incompatibility
+        If F is the gradient of a map y(x), the metric is flat, and its signatures are the signatures of the deformed
+        body. If F describes growth, plastic or elastic strain, the curvature of C is the strain's incompatibility
         (docs/strain.md).
 
         Args:
@@ -170,15 +170,16 @@ class TensorField(eqx.Module):
     ) -> "TensorField":
         """Return a metric made of symmetric tensors S (*shape, d, d) with eigenvalues of either sign, such as stress.
 
-        Indefinite tensors define no metric. Two maps make a metric of them; neither is the default. Both maps keep the
-        eigenvectors and the order of the eigenvalues (Hotz and others 2004):
+        Indefinite tensors define no metric. Two maps from S to a metric g are available, which keep the eigenvectors
+        and the order of the eigenvalues of S (Hotz and others 2004); neither is the default:
 
-        - ``"exp"``: g = exp(S/s), where `number` is the scale s > 0 in the units of S. An eigenvalue σ becomes
-          exp(σ/s). Choose a scale near the largest |σ|.
-        - ``"shift"``: g = S + c·I, where `number` is the shift c, larger than minus the least eigenvalue. The signature
-          flattens as c grows. Near the least possible c, lengths along the strongest compression are almost zero.
+        - ``"exp"``: g = exp(S/s), where `number` is the scale s > 0 in the units of S. An eigenvalue σ of S becomes
+          exp(σ/s). Choose a scale near the largest absolute value of the eigenvalues.
+        - ``"shift"``: g = S + c·I, where `number` is the shift c, larger than minus the least eigenvalue of S. The
+          larger the shift, the less the signature depends on S. With a shift just above its lower limit, lengths along
+          the strongest compression are almost zero.
 
-        docs/strain.md describes the signatures of both metrics.
+        docs/strain.md describes the signatures of the metrics exp(S/s) and S + c·I.
 
         Args:
             S: the tensors; values outside the mask are ignored.
@@ -220,13 +221,13 @@ class TensorField(eqx.Module):
 
 @numpy_where_known(static_argnums=1)
 def _metric_of_diffusion(xp: Any, D: Any, metric: MetricChoice) -> Any:
-    # In three dimensions −D and D have the same adjugate, so tensors that are not positive definite become NaN first.
+    # In three dimensions −D and D have the same adjugate, so D is set to NaN where it is not positive definite.
     return spd.metric_of_diffusion(spd.nan_unless_positive(xp, D), metric)
 
 
 def _evaluate(function: jtu.Partial, grid: Grid) -> Float[Array, "*shape_and_components"]:
-    # Outside the mask the function may be singular, and 0·NaN would spoil derivatives with respect to its parameters.
-    # So the function is evaluated at a node inside the mask instead.
+    # Outside the mask the user's function may be singular, and 0·NaN would make the derivatives with respect to its
+    # parameters NaN. So it is evaluated at a node inside the mask, in place of each node outside.
     inside = grid.inside
     nodes = jax_array(np.where(inside[..., None], grid.nodes, grid.nodes[inside][0]).reshape(-1, grid.dimension))
     flat = jax.vmap(lambda x: real_array("fn", function(x)))(nodes).astype(nodes.dtype)

@@ -15,16 +15,16 @@ FACETS = {
     2: np.array([[1, 2], [2, 0], [0, 1]]),
     3: np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]),
 }
-"""The corners of a simplex's facets by dimension: row i is the facet opposite corner i. The facets of a positively
-oriented simplex are oriented outward."""
+"""The facets of a triangle (key 2) or a tetrahedron (key 3): row i has the corners of the facet opposite corner i. The
+facets of a positively oriented simplex are oriented outward."""
 
 
 @jax.tree_util.register_static
 class Triangulation(ByKey):
     """The connectivity of a mesh of triangles or tetrahedra, static and hashable.
 
-    Facets are the edges of triangles, or the triangles of tetrahedra. Facets are numbered cell by cell: facet (d + 1) c
-    + i is opposite corner i of cell c. A facet between two cells has two numbers.
+    Facets are the edges of triangles, or the triangles of tetrahedra. In dimension d, the facet opposite corner i of
+    cell c has the number (d + 1) c + i, so a facet between two cells has two numbers, one from each cell.
     """
 
     def __init__(self, cells: Int[np.ndarray, "n corners"], n_vertices: int) -> None:
@@ -49,7 +49,7 @@ class Triangulation(ByKey):
 
     @cached_property
     def _grouped_facets(self) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-        """The facets sorted by vertices; whether each is the first with its vertices; the parity of their order."""
+        """Facet numbers, sorted by vertices; whether each begins a new facet; whether its vertices are in odd order."""
         vertices = self.facet_vertices(np.arange(self.cells.size))
         odd = np.zeros(len(vertices), dtype=bool)
         for a, b in combinations(range(self.dimension), 2):
@@ -68,7 +68,7 @@ class Triangulation(ByKey):
 
     @cached_property
     def overlaps(self) -> Int[np.ndarray, "m 2"]:
-        """Pairs of cells that orient a common facet equally; positively oriented cells then lie on the same side.
+        """Pairs of cells that lie on the same side of a common facet if all cells are positively oriented.
 
         If three or more cells share a facet, two of them lie on the same side.
         """
@@ -79,7 +79,7 @@ class Triangulation(ByKey):
 
     @cached_property
     def crowded_facets(self) -> Int[np.ndarray, " m"]:
-        """One number of each facet that belongs to three or more cells."""
+        """The facets that belong to three or more cells, each given by one of its numbers."""
         order, begins, _ = self._grouped_facets
         starts = np.flatnonzero(begins)
         return order[starts[np.diff(np.append(starts, order.size)) > 2]]
@@ -91,7 +91,6 @@ class Triangulation(ByKey):
 
     @cached_property
     def _edges(self) -> tuple[Int[np.ndarray, "E 2"], Int[np.ndarray, "n m"]]:
-        """The edges, and the numbers of each cell's edges in the order of ``combinations`` of its corners."""
         pairs = list(combinations(range(self.dimension + 1), 2))
         ends = np.sort(self.cells[:, pairs], axis=-1)
         keys, numbers = np.unique(ends[..., 0] * self.n_vertices + ends[..., 1], return_inverse=True)

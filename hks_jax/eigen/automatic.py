@@ -22,20 +22,20 @@ _SMALL = 1500
 """The largest number n of unknowns for which the dense solver, which takes O(n³) time, is chosen."""
 
 # The choice is between shift-invert and a solver in JAX, called ``ours``: the Chebyshev filter on grids in 3D or in
-# float32, otherwise block Lanczos. A solver in JAX takes about five seconds to compile at any size. So up to n·k = 5
-# million, the fastest solver of the first call is not the fastest of later calls. Each solver has two ratios of its
-# time to the shortest time: one for the first call and one for later calls. The choice minimises the larger ratio
-# (benchmarks/first_answer/automatic.py), except for small volumes in float32. In float32, block Lanczos also factorises
-# in float32; so it searches repeatedly, and leaves some pairs unconverged.
+# float32, otherwise block Lanczos. A solver in JAX takes about five seconds to compile at any size. So for n·k up to 5
+# million, one solver is the fastest in the first call, and another solver in later calls. For each solver,
+# benchmarks/first_answer/automatic.py divides the time of its first call by the shortest first call of all solvers, and
+# likewise for later calls. The choice minimises the larger of the two ratios, except for small volumes in float32. In
+# float32, block Lanczos also factorises in float32; so it searches repeatedly, and leaves some pairs unconverged.
 _LARGE, _LARGE_IN_SINGLE = 800_000, 5_000_000
-"""The least n·k (unknowns times pairs) for which a solver in JAX is chosen. The second is for 2D grids in float32."""
+"""The least n·k (unknowns times pairs) for which a solver in JAX is chosen: in general, and for 2D grids in float32."""
 
 
 def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensolver:
     """Return the solver with the given name.
 
     ``"auto"`` chooses by the pencil's size, k and dtype. On an accelerator or for traced values (`jax.jit`,
-    `jax.vmap`), it never chooses shift-invert, because shift-invert runs on the host.
+    `jax.vmap`), ``"auto"`` never chooses shift-invert, because shift-invert runs on the host.
 
     Raises:
         ValueError: the name is unknown.
@@ -54,8 +54,8 @@ def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensol
 def choose_for_fit(pencil: AnyPencil, k: int) -> Eigensolver:
     """Return the solver that ``"auto"`` chooses in a fit.
 
-    A fit multiplies many vectors by each Jacobian. Block Lanczos reuses its factorisations in these products; the
-    Chebyshev filter has no factorisations. Fits are traced, so the solver must not run on the host.
+    A fit multiplies many vectors by every Jacobian. The linear solver of block Lanczos reuses its factorisations in all
+    products with one Jacobian. Values are traced in a fit, so the solver must not run on the host.
     """
     n, fitting = pencil.space.n_dof, BlockLanczos(adjoint=FactorisedAdjoint(1e-5, solves=20))
     return fitting if n > _SMALL and k + 20 <= fitting.max_pairs(n) else Dense()

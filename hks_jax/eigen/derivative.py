@@ -36,13 +36,13 @@ _ON_HOST = 1 << 22
 def solved(
     solver: Eigensolver, pencil: SymmetricPencil, k: int, extra: int, interior: bool, throw: bool, report: Report
 ) -> tuple[Values, Vectors, Vectors, Scalar, Scalar]:
-    """Return k eigenvalues, their eigenvectors, the frame (the same vectors), the next eigenvalue, and a bound.
+    """Return k eigenvalues, their eigenvectors, the frame, the next eigenvalue, and a certified bound.
 
-    The pairs are the lowest or, if ``interior``, the first above the origin of a `LocatedPencil`. The derivative of the
-    frame excludes rotations of the k eigenvectors among themselves, and otherwise equals that of the eigenvectors. The
-    next eigenvalue is infinite unless ``extra`` = 1; the bound is the solver's certificate. Derivatives treat the next
-    eigenvalue and the bound as constants. A derivative whose linear solves do not converge is NaN. Such a failure
-    raises an error if ``throw`` is set, and otherwise a warning if values are concrete.
+    The pairs are the k lowest eigenpairs or, if ``interior``, the first k above the origin of a `LocatedPencil`. The
+    frame is equal to the eigenvectors, but its derivative excludes rotations of the k eigenvectors among themselves.
+    The next eigenvalue is infinite unless ``extra`` = 1. The solver certifies that none of the k eigenvalues is missing
+    below the bound. Derivatives treat the next eigenvalue and the bound as constants. Derivatives whose linear solves
+    do not converge are NaN, and raise an error if ``throw`` is set, or else cause a warning if values are concrete.
     """
     values, vectors, complete_below = _computed(solver, pencil, k, extra, interior, report)
     values, vectors, following = _cut(values, vectors, k)
@@ -53,22 +53,23 @@ def solved(
 #
 #     dλᵢ = φᵢᵀfᵢ,    dφᵢ = −½ (φᵢᵀ dM φᵢ) φᵢ + Σ_{j≠i} φⱼ (φⱼᵀfᵢ)/(λᵢ − λⱼ).
 #
-# The sum is over all j. The terms for computed pairs are evaluated directly. The sum xᵢ of the other terms solves
+# The terms of dφᵢ for computed eigenvectors φⱼ are evaluated directly. The sum xᵢ of all other terms of dφᵢ solves
 #
 #     (K − λᵢM) xᵢ = −Q fᵢ,   Φᵀ M xᵢ = 0,   Q = I − MΦΦᵀ,
 #
-# on the M-orthogonal complement of the computed eigenvectors Φ. On this complement, K − λᵢM is positive definite.
-# Reverse mode uses the symmetry of the map fᵢ ↦ xᵢ. The solver computes some guard pairs beyond k, so that λᵢ is not
-# close to the eigenvalues on the complement. In the interior of a spectrum, the complement has eigenvalues on both
-# sides of λᵢ. So guards lie on both sides: at most half of them below the origin, and the others after the k pairs.
+# on the M-orthogonal complement of the computed eigenvectors Φ, where K − λᵢM is positive definite. Reverse mode uses
+# the symmetry of the map fᵢ ↦ xᵢ. The solver computes some guard pairs beyond k, so that λᵢ is not close to the
+# eigenvalues on the complement of Φ. In the interior of a spectrum, the complement of Φ has eigenvalues on both sides
+# of λᵢ. So in the interior, at most half of the guard pairs lie below the origin, and the others follow the k pairs.
 #
 # If λᵢ = λⱼ and j ≠ i, the coefficient of φⱼ in dφᵢ is arbitrary (a gauge), because every basis of the eigenspace is
-# valid. The rule sets this coefficient to −½ φⱼᵀ dM φᵢ, which keeps Φ M-orthonormal and is never NaN. The rule does the
-# same if |λᵢ − λⱼ| is below √ε (λ − λ₀), where λ is the larger of the two eigenvalues and λ₀ the lowest of all; a
-# division by such a gap would lose all digits. So dφᵢ is a derivative only if λᵢ is simple. For equal eigenvalues, only
-# the sum of their dλᵢ has a meaning. Spectral functions do not depend on the basis, so their derivatives must not
-# contain the gauge. They use the frame, whose derivative contains only the sum over j > k, which is the same for every
-# basis of the first k eigenvectors (hks_jax/signatures/spectral_functions.py). `of_simple` hides the gauge from users.
+# valid. The derivative rule sets gauge coefficients to −½ φⱼᵀ dM φᵢ, which keeps Φ M-orthonormal and is never NaN. A
+# coefficient also counts as a gauge if |λᵢ − λⱼ| is below √ε (λ − λ₀), where λ is the larger of the two eigenvalues and
+# λ₀ the lowest of all, because a division by so small a gap would lose all digits. So dφᵢ is a derivative only if λᵢ is
+# simple. For equal eigenvalues, only the sum of their dλᵢ has a meaning. Spectral functions do not depend on the basis,
+# so their derivatives must not contain gauge coefficients. Derivatives of spectral functions use the frame, whose
+# derivative has only the terms of dφᵢ with j > k (hks_jax/signatures/spectral_functions.py). `of_simple` replaces
+# eigenvector derivatives with gauge coefficients by NaN.
 @solved.defjvp
 def _solved_jvp(
     solver: Eigensolver, k: int, extra: int, interior: bool, throw: bool, report: Report, primals: Any, changes: Any
@@ -78,10 +79,10 @@ def _solved_jvp(
     spare = max(extra, min(sides * solver.guards(k, n_dof), solver.max_pairs(n_dof) - k))
     values, vectors, complete_below = _computed(solver, pencil, k, spare, interior, report)
     adjoint = InteriorAdjoint(solver.adjoint.tolerance) if interior else solver.adjoint
-    # The prepared data do not depend on the change, so all products with one Jacobian share them.
+    # Data from `prepare` do not depend on the pencil's tangent, so all products with one Jacobian share these data.
     prepared = one_by_one(_prepare, (adjoint, k), pencil, values) if _solves(pencil, k, len(values)) else None
     if isinstance(pencil, Pencil) and pencil.metric is not None:
-        # Reverse mode stores all arrays of the arguments; derivatives do not need the metric.
+        # The metric is removed: derivatives do not need it, and reverse mode would store its arrays.
         pencil = eqx.tree_at(lambda p: p.metric, pencil, None)
     on_failure: OnFailure = "error" if throw else "nothing" if is_traced(primals) else "warning"
     eigenvalues, functions, following = _cut(values, vectors, k)
@@ -93,7 +94,6 @@ def _solved_jvp(
 def _computed(
     solver: Eigensolver, pencil: SymmetricPencil, k: int, spare: int, interior: bool, report: Report
 ) -> RawPairs:
-    """Return k + spare computed pairs, and the bound that the solver certifies."""
     if interior:
         return one_by_one(first_from_origin, (solver, k, spare, report), pencil)
     values, vectors, bound = one_by_one(_lowest, (solver, k + spare, report), pencil)
@@ -104,7 +104,6 @@ def _computed(
 
 @numpy_where_known(static_argnums=2)
 def _cut(xp: Any, values: Any, vectors: Any, k: int) -> tuple[Any, Any, Any]:
-    """Return the first k pairs, and the next eigenvalue, or infinity if there is none."""
     return values[:k], vectors[:k], values[k] if len(values) > k else xp.asarray(xp.inf, values.dtype)
 
 
@@ -119,7 +118,7 @@ def _shapes(*args: Any) -> tuple[Any, Any, Any]:
 
 
 def _numpy_rule(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
-    """Compute `tangents_of` by NumPy. Given cotangents y of its result, compute cotangents of the change instead."""
+    """Compute `tangents_of` by NumPy; if cotangents y of its result are given, compute the cotangent of ``change``."""
     adjoint, on_failure, prepared, pencil, _, *pairs = known
     values, vectors, functions = map(np.asarray, pairs)
     if vectors.size > _ON_HOST or x is None:
@@ -147,7 +146,7 @@ def _numpy_rule(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> A
         into, frame = force @ functions.T, onto(force)
         within = np.where(apart[:, :k], inverse[:, :k] * into, -(moved @ functions.T) / 2)
         return np.diagonal(into), within @ functions + frame, frame
-    # The transpose of the computation above.
+    # Reverse mode is the transpose of the computation above.
     of_values, of_vectors, of_frame = y
     within = of_vectors @ functions.T
     into = np.where(apart[:, :k], inverse[:, :k] * within, 0) + np.diag(of_values)
@@ -157,7 +156,7 @@ def _numpy_rule(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> A
 
 
 def change_of(change: SymmetricPencil, x: Rows, *p: Rows) -> SymmetricPencil:
-    """Return a pencil's cotangent Σᵢ pᵢxᵢᵀ, where the first p is for the stiffness and the second is for the mass."""
+    """Return a pencil's cotangent with stiffness Σᵢ aᵢxᵢᵀ and mass Σᵢ bᵢxᵢᵀ, for the rows xᵢ of x and p = (a, b)."""
     zeros = jax.tree.map(lambda like: jax.device_put(np.zeros(like.shape, like.dtype)), change)
     matrices = tuple(matrix.outer(each, x) for matrix, each in zip((zeros.stiffness, zeros.mass), p, strict=True))
     return eqx.tree_at(lambda pencil: (pencil.stiffness, pencil.mass), zeros, matrices)
@@ -184,7 +183,7 @@ def tangents_of(
     vectors: Vectors,
     functions: Rows,
 ) -> tuple[OfRows, Rows, Rows]:
-    """Return dλ, dφ and the derivative of the frame for the first k of p computed pairs.
+    """Return the tangents of the first k of p computed eigenvalues, their eigenvectors, and the frame of `solved`.
 
     ``prepared`` is the result of `Adjoint.prepare`. ``functions`` are the first k vectors, passed separately because
     slicing ``vectors`` would copy the slice.
@@ -194,11 +193,11 @@ def tangents_of(
     moved = change.mass.apply(functions)
     force = change.stiffness.apply(functions) - eigenvalues[:, None] * moved
     apart, inverse = _gaps(jnp, values, k, indistinct(pencil, values.dtype))
-    # The product with the guards is separate, because reverse mode of the frame needs only that product.
+    # Inner products with the guards are separate, because reverse mode of the frame needs no other inner products.
     into = inner_products(functions, force)
     within = jnp.where(apart[:, :k], inverse[:, :k] * into, -inner_products(functions, moved) / 2)
 
-    # This symmetric map is its own transpose. The transpose derived by JAX would be several times slower.
+    # `onto_guards` is symmetric, so it is its own transpose. JAX's automatic transpose would be several times slower.
     def onto_guards(force: Rows) -> Rows:
         return matmul(inverse[:, k:] * inner_products(guards, force), guards)
 
@@ -207,9 +206,9 @@ def tangents_of(
 
     frame = with_transpose(onto_guards, onto_guards, force)
     if _solves(pencil, k, len(values)):
-        # The force is zero for null vectors that every perturbation of K annihilates. In reverse mode, the rows of
-        # these null vectors are cotangents, which may be nonzero; so the solutions in these rows are set to zero. JAX
-        # needs the product with the matrix only for second derivatives, so the identity may replace this product.
+        # If every perturbation of K annihilates a null vector φᵢ, its force fᵢ is zero, and so is xᵢ. In reverse mode,
+        # a cotangent that may be nonzero replaces fᵢ, so xᵢ is set to zero for such null vectors. JAX would
+        # use products with K − λᵢM only in second derivatives, which are not supported; the identity replaces them.
         free = np.arange(k)[:, None] >= pencil.n_fixed
         rhs = jnp.where(free, -force, 0)
         frame = frame + jnp.where(free, jax.lax.custom_linear_solve(lambda x: x, rhs, solve, symmetric=True), 0)
@@ -245,13 +244,13 @@ def _checked(on_failure: OnFailure, x: Rows) -> Rows:
 def _with_null_modes(xp: Any, mass: Any, nulls: Any, values: Any, vectors: Any) -> tuple[Any, Any]:
     """Replace the solver's approximations of null vectors by the pencil's null vectors.
 
-    The eigenvalues of null vectors become 0 instead of about ±1e-13. Other vectors become orthogonal to null vectors.
+    The eigenvalues of null vectors become 0, not about ±1e-13. All other vectors become M-orthogonal to null vectors.
     """
     product: Any
     inverse_cholesky: Any
     if xp is jnp:
         product, inverse_cholesky = matmul, lapack.inverse_cholesky
-        nulls = jax.lax.optimization_barrier(nulls)  # otherwise XLA would fold long constants during compilation
+        nulls = jax.lax.optimization_barrier(nulls)  # keeps XLA from folding these constants
     else:
         product, inverse_cholesky = np.matmul, lambda gram: np.linalg.inv(np.linalg.cholesky(gram))
     nulls = nulls[: values.size]
@@ -271,8 +270,7 @@ def _with_null_modes(xp: Any, mass: Any, nulls: Any, values: Any, vectors: Any) 
 def frame_of_chosen(vectors: Rows, mass: Operator, chosen: Bool[Array, " k"]) -> Rows:
     """Return the vectors, with a derivative that excludes rotations of the chosen vectors among themselves.
 
-    The result is a frame of the chosen vectors. A frame of all vectors would also exclude rotations towards other
-    vectors.
+    The derivative contains rotations of the chosen vectors towards the vectors that are not chosen.
     """
     return vectors
 
@@ -285,9 +283,9 @@ def _frame_of_chosen_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]
     return vectors, change - matmul(inside, vectors)
 
 
-# The transpose derived by JAX would multiply by the transposed vectors, which takes twice as long.
+# JAX's automatic transpose of the inner products would multiply by the transposed vectors, which takes twice as long.
 def products_with_constants(images: Float[Array, "b n_dof"], vectors: Rows) -> Float[Array, "b k"]:
-    """Return the inner products of images and vectors; derivatives treat the vectors as constants."""
+    """Return the inner products of rows of ``images`` and ``vectors``; derivatives treat ``vectors`` as constant."""
     return with_transpose(partial(inner_products, vectors), lambda mix: matmul(mix, vectors), images)
 
 
@@ -300,8 +298,8 @@ def of_simple(
 
 
 # For equal eigenvalues λᵢ = λⱼ = λ, the derivative of Σᵢ f(λᵢ) φᵢ(x)² contains f'(λ) φᵢ φⱼ φᵢᵀ(dK − λ dM)φⱼ. The
-# derivatives of the f(λᵢ) give only the terms with i = j. Rotations among these φᵢ cancel, because the f(λᵢ) are equal.
-# So no finite dφᵢ makes the derivative correct.
+# derivatives dλᵢ give only the terms with i = j. Rotations of the eigenvectors of λ give no terms, because they do not
+# change the sum of their φᵢ(x)². So no finite derivative of eigenvectors gives the terms with i ≠ j.
 @of_simple.defjvp
 def _of_simple_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     vectors, values, following, kept, part, pencil = primals

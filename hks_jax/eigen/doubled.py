@@ -21,11 +21,12 @@ from hks_jax.traced import is_traced
 def solve_doubled(
     pencil: MirrorPencil, solvers: list[Eigensolver], k: int, extra: int, throw: bool, report: Report
 ) -> Eigenpairs:
-    """Solve all parts and return the k lowest pairs of the merged spectrum; ``extra`` = 1 adds the next eigenvalue.
+    """Return the k lowest pairs of a doubled domain, from the problems of its parts; ``extra`` = 1 adds one eigenvalue.
 
-    For traced values, each part computes the largest number of pairs that it may contribute (`_limits`). For concrete
-    values, each part begins with an equal share plus a margin, and doubles this number while a pair may be missing. By
-    Weyl's law, boundary conditions change a part's share by about the square root of the total.
+    For traced values, each part's problem is solved for the largest number of pairs that this part can have among the k
+    lowest (`_limits`). For concrete values, each part's problem is first solved for an equal share of the k pairs plus
+    a margin, and again for twice as many pairs while some of its pairs may be missing. The margin is about 2√k, because
+    by Weyl's law boundary conditions change the number of a part's pairs among the k lowest by about √k.
     """
     parts, total = pencil.parts, k + extra
     whole, limits = widened(pencil, solvers, total), _limits(pencil, total)
@@ -57,7 +58,7 @@ def solve_doubled(
 
 
 def _limits(pencil: MirrorPencil, total: int) -> list[int]:
-    """Return the largest number of pairs that each part can have among the ``total`` lowest."""
+    """Return, for each part, the largest possible number of its pairs among the ``total`` lowest pairs of all parts."""
     shares = zip(pencil.including, pencil.parts, strict=True)
     return [min(max(total // len(including), 1), part.size) for including, part in shares]
 
@@ -77,7 +78,7 @@ def _of_problem(report: Report, number: int, of: int) -> Report:
 
 @partial(jax.jit, static_argnames=("k", "extra"))
 def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: int) -> Eigenpairs:
-    """Merge the parts' pairs and return the k lowest; with ``extra`` = 1 also the next eigenvalue."""
+    """Merge the pairs of all parts, and return the k lowest; with ``extra`` = 1, also return the next eigenvalue."""
     values, sizes = jnp.concatenate([pairs.eigenvalues for pairs in solved]), [pairs.k for pairs in solved]
     order = jnp.argsort(jnp.concatenate(_sorted_by(pencil, solved)))
     lowest, ends = order[:k], np.cumsum(sizes)[:-1]
@@ -107,11 +108,11 @@ def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: i
     )
 
 
-# Let part B's trial functions include those of part A. Then the j-th eigenvalue of A is not below the j-th eigenvalue
-# of B. If the two eigenvalues are equal, rounding may swap them; then A could have more pairs among the lowest than
-# `MirrorPencil.including` allows.
+# If the trial functions of part B include those of part A, the j-th eigenvalue of part A is not below the j-th
+# eigenvalue of part B. If the j-th eigenvalues of both parts are equal, rounding may exchange their order, so that part
+# A could have more of the lowest eigenvalues of the doubled domain than `MirrorPencil.including` allows.
 def _sorted_by(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...]) -> list[Float[Array, " _"]]:
-    """Return each part's eigenvalues, the j-th raised to the j-th eigenvalue of every part that includes this part."""
+    """Return sort keys: the maximum of a part's j-th eigenvalue and those of all parts that include this part."""
     keys: list[Array] = []
     for pairs, including in zip(solved, pencil.including, strict=True):
         own = pairs.eigenvalues
@@ -125,10 +126,10 @@ def _sorted_by(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...]) -> list[Flo
 def _complete_below(
     pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], reach: Float[Array, " 1"], total: int
 ) -> Float[Array, ""]:
-    """Return the bound below which the pairs of all parts are complete.
+    """Return the bound below which no eigenvalue of the doubled domain is missing.
 
-    The certificate of a part may reach only to its last computed eigenvalue. But if a part already has the largest
-    possible number of pairs up to ``reach``, the part has no further eigenvalue below ``reach``.
+    A part's solver may certify completeness only below the part's last computed eigenvalue. But a part with as many
+    pairs as `_limits` allows has no further eigenvalue below ``reach``, the last of the ``total`` lowest eigenvalues.
     """
     bounds = []
     for pairs, limit in zip(solved, _limits(pencil, total), strict=True):

@@ -47,7 +47,7 @@ def eigenpairs(
             (K, M). `sparse_pencil` describes the accepted matrices.
         k: the number of pairs, from 1 to the number of degrees of freedom. With an interval, leave k out; but if values
             are traced, k must be the number of eigenvalues in the interval (`count_eigenvalues`).
-        boundary: see `assemble`. This argument applies only to fields and meshes.
+        boundary: the boundary condition of a field or mesh; see `assemble`.
         solver: ``"auto"`` (a choice by size, but never a solver on the host under `jit`, `vmap` or on accelerators),
             ``"dense"``, ``"shift-invert"`` (on the host), ``"block-lanczos"`` (mainly for 2D and surfaces),
             ``"chebyshev-filter"`` (for grids, mainly in 3D), or a solver object such as
@@ -55,9 +55,9 @@ def eigenpairs(
             stiffness that may be indefinite, needs ``"dense"`` or ``"block-lanczos"``. For an indefinite stiffness with
             concrete values, ``"shift-invert"`` works too. For an interval, derivatives use only the tolerance of the
             solver's ``adjoint``.
-        mass: ``"consistent"`` or ``"lumped"``. This argument applies only to fields and meshes.
+        mass: the mass matrix of a field or mesh, ``"consistent"`` or ``"lumped"``.
         multiplet: the treatment of a multiple eigenvalue that k cuts, so that only some of its pairs are among the k
-            lowest; unused with an interval. ``"report"`` warns. ``"drop"`` excludes these pairs from every signature.
+            lowest; unused with an interval. ``"report"`` warns. ``"drop"`` excludes its pairs from every signature.
             ``"complete"`` computes 8 more pairs and includes the missing pairs, or drops the eigenvalue if 8 pairs are
             too few. ``.kept`` marks the included pairs.
         throw: whether to raise an error if ``.result`` is not successful or derivatives do not converge; under `jit`, a
@@ -65,7 +65,7 @@ def eigenpairs(
             did not converge are NaN, and concrete values cause a warning.
         progress: a function such as ``print`` that receives short texts during a computation with concrete values.
         interval: the ends (a, b) of an interval; all eigenpairs with a ≤ λ < b are computed instead of the lowest.
-        quadrature: see `assemble`. This argument applies only to fields and meshes.
+        quadrature: the quadrature rule for a field or mesh; see `assemble`.
 
     Returns:
         The pairs with residuals and convergence flags. The eigenvalue of a null vector is exactly zero. (Each component
@@ -147,7 +147,7 @@ def eigsh(
         progress: see `eigenpairs`.
 
     Returns:
-        The pairs with residuals, convergence flags and the certificate. All signatures accept them.
+        The pairs, which all signatures accept, with residuals, convergence flags and the certificate.
 
     Raises:
         ValueError: `sparse_pencil` or `eigenpairs` does not accept an argument.

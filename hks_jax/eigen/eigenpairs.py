@@ -46,22 +46,23 @@ class Eigenpairs(eqx.Module):
     Attributes:
         eigenvalues: (k,) in ascending order, in 1/(metric length)²; exactly 0 for null vectors.
         vectors: (k, n_dof) coefficients of the eigenfunctions, with φᵢᵀMφⱼ = δᵢⱼ. For the boundaries "mirror" and
-            "mean", M is that of the doubled domain; so each doubling divides the norm on the domain itself by √2.
-        frame: (k, n_dof) the values of `vectors`, but with a derivative that excludes rotations of eigenfunctions among
-            themselves. Such rotations are singular at multiple eigenvalues, and do not affect signatures.
+            "mean", M is the mass of the domain doubled m times; on the domain itself, the norm of each φᵢ is 1/√2ᵐ.
+        frame: (k, n_dof) the values of `vectors`, but with a derivative that excludes rotations of eigenvectors among
+            themselves, which are singular at multiple eigenvalues. Derivatives of signatures include the effect of such
+            rotations by divided differences.
         residuals: (k,) ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁), where λ₁ is the first positive eigenvalue. In an interval, or if
             the null space is unknown, max(λ, λ₁) is replaced by the larger of two numbers: the mean gap of the
             eigenvalues, and the distance of λ from `spectral_origin`.
         converged: (k,) whether the residual is at most the solver's tolerance, or at most the level of rounding.
-        kept: (k,) whether each pair belongs to the truncated spectrum; signatures ignore the other pairs.
-            ``multiplet="drop"`` and ``"complete"`` may exclude the last pairs; `of_part` excludes other parts.
+        kept: (k,) whether each pair belongs to the truncated spectrum; signatures ignore the other pairs. The choices
+            ``multiplet="drop"`` and ``"complete"`` may exclude the last pairs; `of_part` keeps only one part's pairs.
         part: (k,) for the boundaries "mirror" and "mean", the index of the pencil's part that each pair belongs to (0
             is the Neumann problem); otherwise None.
         next_eigenvalue: the first eigenvalue that is not kept; infinite if it does not exist or was not computed, as
-            for an interval. Derivatives treat this number as a constant.
-        complete_below: a bound. The solver certifies that it missed no eigenvalue below the bound (for an interval,
+            for an interval. Derivatives treat `next_eigenvalue` as a constant.
+        complete_below: the bound below which the solver certifies that it missed no eigenvalue (for an interval,
             between the lower end and the bound), by Sylvester's law of inertia or because it computed all eigenvalues.
-            The bound is NaN if there is no certificate. Derivatives treat the bound as a constant.
+            `complete_below` is NaN without a certificate. Derivatives treat `complete_below` as a constant.
         spectral_origin: the reference point of relative errors: 0 if K ⪰ 0 is known, otherwise the lowest eigenvalue;
             for an interval its lower end.
         multiplet_tolerance: the gap, relative to the distance from `spectral_origin`, below which neighbouring
@@ -122,14 +123,14 @@ class Eigenpairs(eqx.Module):
         if pencil is self.pencil:
             return self
         vectors = self.space.transfer(self.vectors, pencil.space)
-        # The frame has the same values as the vectors; a separate transfer is needed only for its derivative.
+        # `frame` has the same values as `vectors`; it is transferred separately only if it may have a derivative.
         frame = self.space.transfer(self.frame, pencil.space) if is_traced(self.frame) else vectors
         return eqx.tree_at(lambda p: (p.vectors, p.frame, p.pencil), self, (vectors, frame, pencil))
 
     @property
     def null_space_known(self) -> bool:
         """Whether the pairs are the lowest, and the pencils' null spaces are known."""
-        # Pairs inside a fit have no pencil; fits are for fields, whose null spaces are known.
+        # `Eigenpairs` in the outcome of a fit have no pencil. A fit is for a tensor field, whose null space is known.
         return self.lowest and (self.pencil is None or all(part.null_space is not None for part in self.pencil.parts))
 
     @property
@@ -157,9 +158,9 @@ class Eigenpairs(eqx.Module):
 
     @property
     def unconfirmed(self) -> Bool[Array, ""]:
-        """Whether the solver's certificate ends before the last eigenvalue.
+        """Whether the solver's certificate ends below the last kept eigenvalue.
 
-        If a lower bound of the spectrum is known, this is false without a certificate, because some solvers give none.
+        If a lower bound of the spectrum is known, no certificate is needed, because some solvers give none.
         """
         if not self.k:
             return jnp.zeros((), bool)
@@ -169,8 +170,7 @@ class Eigenpairs(eqx.Module):
 
     @property
     def result(self) -> RESULTS:
-        """The most serious failure, a traceable code. Compare it with ``RESULTS.successful``, or call its
-        ``error_if``."""
+        """The traceable code of the most serious failure, for a comparison with ``RESULTS.successful``."""
         finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(self.pencil) if eqx.is_inexact_array(leaf)]
         code: Any = RESULTS  # mypy sees its members as strings
         result = code.where(self.unconfirmed, code.unconfirmed, code.successful)
@@ -289,7 +289,6 @@ def truncate(pairs: Eigenpairs, k: int, multiplet: MultipletChoice) -> Eigenpair
 def _choose(
     xp: Any, values: Any, following: Any, origin: Any, tolerance: Any, k: int, multiplet: MultipletChoice
 ) -> tuple[Any, Any]:
-    """Return a mask (n) of the kept pairs, and the first eigenvalue that is not kept."""
     size = len(values)
     sequence = xp.append(values, following)
     index = xp.arange(size)

@@ -27,7 +27,7 @@ from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.traced import is_traced
 
 _BESIDE = (1e-6, 1e-5, 1e-4, 1e-3)
-"""Relative distances from a shift at which to count if the factorisation at the shift itself is too inaccurate."""
+"""Relative distances from a shift at which eigenvalues are counted if the factorisation at the shift is inaccurate."""
 _TRIES = 60
 """The maximal number of factorisations in a search."""
 _JUST_BELOW = 0.625
@@ -52,14 +52,14 @@ def count_eigenvalues(
     By Sylvester's law of inertia, the number of eigenvalues below σ is the number of negative eigenvalues of K − σM,
     which a factorisation LDLᵀ shows. So one factorisation certifies that a list of eigenvalues is complete. Random
     right-hand sides test whether the error of the factorisation could change its inertia. If σ is an eigenvalue of the
-    domain or of a part of the domain, the error may be too large; then the function counts on both sides of σ. The
-    function works under `jit`.
+    domain or of a part of the domain, the factorisation may fail this test; outside `jit`, the function then counts the
+    eigenvalues at two numbers just below and above σ. The function works under `jit`.
 
     Args:
         domain: a tensor field, a mesh, a pencil, K, or (K, M), as in `eigenpairs`.
         below: σ, in 1/(metric length)². The count is uncertain if σ is an eigenvalue.
-        boundary: see `assemble`. This argument applies only to fields and meshes.
-        mass: see `assemble`. This argument applies only to fields and meshes.
+        boundary: the boundary condition of a field or mesh; see `assemble`.
+        mass: the mass matrix of a field or mesh; see `assemble`.
 
     Returns:
         The number of eigenvalues less than σ; −1 if values are traced and the number is uncertain.
@@ -101,7 +101,7 @@ def count_below(pencil: AnyPencil, below: Scalar | float) -> Number:
         return jnp.where(sound, count, -1)
     if sound:
         return count
-    # If the shift is near zero, distances are relative to the expected lowest positive eigenvalue.
+    # Distances are relative to |σ| or, if σ is near zero, to the expected size of the lowest positive eigenvalue.
     volume, dimension = pencil.volume, pencil.space.dimension
     least = 1e-6 * largest(pencil.parts[0]) if volume is None or dimension is None else volume ** (-2 / dimension)
     size = max(abs(float(shift)), float(least))
@@ -131,7 +131,7 @@ def certain_count(pencil: SymmetricPencil, shift: Scalar) -> Count:
     return _certain_count(pencil, dissect(pencil.pattern), shift)
 
 
-# The dissection is an argument, because compilation would process a constant of this size (74 MB at 1024² nodes).
+# The nested dissection is an argument, because compilation with so large a constant (74 MB at 1024² nodes) is slow.
 @jit_quickly()
 def _certain_count(pencil: SymmetricPencil, dissection: Dissection, shift: Scalar) -> Count:
     factor, trial, _ = certain_factorisation(dissection, pencil, shift)
@@ -155,21 +155,19 @@ def translated(
 
 
 class _Descent(NamedTuple):
-    """The state of the search for a distance below the origin within which about as many eigenvalues lie as allowed."""
-
-    near: Scalar  # the largest distance so far within which at most the allowed number of eigenvalues lie; 0 at first
-    number: Number  # the number of eigenvalues within `near`
-    far: Scalar  # the least distance so far within which too many eigenvalues lie; ∞ at first
-    next: Scalar  # the next distance at which to count
-    tries: Number  # the number of counts so far
+    near: Scalar  # the largest distance below the origin that is known to contain at most ``most`` eigenvalues
+    number: Number  # the number of eigenvalues within the distance `near` below the origin
+    far: Scalar  # the least distance below the origin that is known to contain more than ``most`` eigenvalues
+    next: Scalar  # the distance below the origin at which eigenvalues are counted next
+    tries: Number  # the number of factorisations so far
     going: Flag  # whether the search goes on
 
 
 def lowered(pencil: LocatedPencil, most: int, probes: int) -> tuple[Scalar, Number]:
-    """Return a distance below the origin, and the number of eigenvalues within this distance, from `most`/2 to `most`.
+    """Return a distance below the origin, and the number of eigenvalues within it, from ``most``/2 to ``most``.
 
-    The number is smaller if no more eigenvalues exist, or if the next eigenvalue is multiple and would make the number
-    exceed `most`. Each factorisation is tested with `probes` random right-hand sides.
+    The number of eigenvalues is less than ``most``/2 if no more exist below the origin, or if a multiple eigenvalue
+    would raise it above ``most``. Each factorisation is tested with ``probes`` random right-hand sides.
     """
     count, dtype = _counting(pencil, probes), pencil.stiffness.dtype
 
@@ -190,7 +188,7 @@ def _descended(state: _Descent, count: Number, sound: Flag, negative: Number, sp
     near, number = jnp.where(nearer, state.next, state.near), jnp.where(nearer, passed, state.number)
     far = jnp.where(farther, state.next, state.far)
     following = jnp.where(jnp.isfinite(far), (near + far) / 2, 4 * near)
-    # If the count is uncertain, count at a slightly larger distance.
+    # If the number of eigenvalues within a distance is uncertain, the next distance is slightly larger.
     following = jnp.where(sound, following, state.next + 1e-2 * (jnp.minimum(far, 2 * state.next) - state.next))
     few, narrow = (2 * number < most) & (number < negative), far - near <= _ALIKE * jnp.maximum(near, spacing)
     tries = state.tries + 1
@@ -204,8 +202,8 @@ class _Search(NamedTuple):
     high: Scalar  # the lowest shift so far with eigenvalues below it; ∞ at first
     number: Number  # the number of eigenvalues below `high`
     first: Scalar  # the highest shift with `number` eigenvalues below it; solves there are most accurate
-    next: Scalar  # the next shift at which to count
-    tries: Number  # the number of counts so far
+    next: Scalar  # the shift below which eigenvalues are counted next
+    tries: Number  # the number of factorisations so far
     going: Flag  # whether the search goes on
 
 
@@ -218,14 +216,14 @@ def locate(pencil: SymmetricPencil, wanted: int, probes: int) -> tuple[Scalar, S
     """
     size, count = scale(pencil), _counting(pencil, probes)
     infinite = jnp.full((), jnp.inf, size.dtype)
-    # The first shift is just below zero. There, a singular K ⪰ 0 has the count 0 and an accurate factorisation.
+    # The first shift is just below zero: a singular K ⪰ 0 has no eigenvalue below it, and an accurate factorisation.
     least = jnp.asarray(float(jnp.finfo(size.dtype).eps) ** _JUST_BELOW, size.dtype) * size
     none = jnp.zeros((), int)
 
     def step(state: _Search) -> _Search:
         return _narrowed(state, *count(state.next), size, least, wanted, pencil.size)
 
-    # Outside `jit`, the steps call the same compiled functions as the slices that follow.
+    # Outside `jit`, the search for the origin calls the same compiled factorisation as spectrum slicing, which follows.
     start = _Search(-infinite, infinite, none, infinite, -least, none, jnp.ones((), bool))
     state = while_loop(lambda state: state.going, step, start)
     known = jnp.isfinite(state.low) & jnp.isfinite(state.high)
@@ -241,11 +239,11 @@ def _narrowed(state: _Search, count: Number, sound: Flag, size: Scalar, least: S
     high, number = jnp.where(lower, state.next, state.high), jnp.where(lower, count, state.number)
     first = jnp.where(lower & (count != state.number), state.next, state.first)
     share = jnp.clip(wanted / jnp.maximum(number, 1).astype(dtype), 1 / 16, 1 / 2)
-    # Without a lower end, search downwards; without an upper end, search upwards. Steps grow by a factor of four.
+    # If the bracket has no lower end yet, the shift decreases; if it has no upper end yet, the shift increases.
     down, up = jnp.minimum(-size, 4 * state.next), 4 * jnp.maximum(low, 0) + size * wanted / n
     bracketed = jnp.isfinite(low) & jnp.isfinite(high)
     following = jnp.where(bracketed, low + share * (high - low), jnp.where(jnp.isfinite(high), down, up))
-    # If the count is uncertain, count at a slightly larger shift.
+    # If the number of eigenvalues below a shift is uncertain, the next shift is slightly larger.
     beside = state.next + 1e-3 * jnp.where(bracketed, high - low, size * wanted / n)
     few, tries = (number <= 2 * wanted) | (high - low <= _NARROW * least), state.tries + 1
     going = ~(bracketed & few) & (tries < _TRIES)

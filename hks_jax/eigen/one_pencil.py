@@ -31,7 +31,7 @@ _FAR = 30
 
 
 def widened(pencil: AnyPencil, solvers: Sequence[Eigensolver], k: int) -> AnyPencil:
-    """Return the pencil `on_all_nodes`, so that masks share one compilation. For the dense solver, return `pencil`."""
+    """Return the pencil `on_all_nodes`, so that all masks share compiled code; unchanged for the dense solver."""
     return pencil if any(isinstance(solver, Dense) for solver in solvers) else on_all_nodes(pencil, k)
 
 
@@ -83,8 +83,8 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
     values = jax.lax.stop_gradient(found[0])
     spread = values[-1] - values[0]
     if not is_traced(values) and spread > indistinct(moved, values.dtype) and values[0] > _FAR * spread:
-        # Solve again from an origin nearer to the spectrum, because distances from a remote origin have fewer correct
-        # digits. For equal eigenvalues, this loss does not matter.
+        # Solve again from an origin nearer to the spectrum, because distances of eigenvalues from a remote origin have
+        # fewer correct digits. If all eigenvalues are equal, the lost digits do not matter.
         origin = origin + values[0] - spread
         moved, found = solve(origin, 2 * spread, spread / number)
     if number > k:
@@ -206,9 +206,8 @@ def _quality(
 ) -> tuple[Any, ...]:
     """Return residuals, convergence flags, flags of zero eigenvalues, and the multiplet tolerance.
 
-    Residuals are relative to the distance of the eigenvalue from the origin. This distance is bounded below by the
-    first positive eigenvalue if the null space is known, by `largest_of` if all eigenvalues are zero, and otherwise by
-    the mean gap.
+    Each residual is divided by the distance of its eigenvalue from the origin, but at least by the first positive
+    eigenvalue if the null space is known, by `largest_of` if all eigenvalues are zero, and otherwise by the mean gap.
     """
     measure = measured_on_host if xp is np else measure_pairs
     (_, residuals, twice), k = measure(pencil, vectors, values), values.size

@@ -75,7 +75,7 @@ def allowed_residuals(scale: Any, rounding: Any, tolerance: float, xp: Any = jnp
 
 
 def indistinct(pencil: SymmetricPencil, dtype: np.dtype) -> Float[Array, ""]:
-    """Return 4 ε times the `largest` eigenvalue. Eigenvalues at a smaller distance are equal within rounding."""
+    """Return 4 ε times the `largest` eigenvalue: the distance at which two eigenvalues are equal within rounding."""
     return 4 * jnp.finfo(dtype).eps * largest(pencil)
 
 

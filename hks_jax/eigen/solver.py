@@ -36,7 +36,7 @@ class Status(str):
     seconds_left: float | None
 
     def __new__(cls, text: str, seconds_left: float | None = None) -> "Status":
-        """Make the text with the estimate."""
+        """Make a progress text with an estimate of the remaining seconds."""
         status = super().__new__(cls, text)
         status.seconds_left = seconds_left
         return status
@@ -52,7 +52,8 @@ class Eigensolver(eqx.Module, Generic[P]):
     Attributes:
         name: the name of the method in reports.
         indefinite: whether the method supports a stiffness that is indefinite, or whose null space is unknown.
-        adjoint: the linear solver for derivatives. The default supports every pencil that can be factorised.
+        adjoint: the linear solver for derivatives. The default, `FactorisedAdjoint`, needs a pencil that it can
+            factorise.
         tolerance: the relative residual ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁) at which a pair counts as converged, or the
             level of rounding if that is larger.
     """
@@ -67,10 +68,10 @@ class Eigensolver(eqx.Module, Generic[P]):
 
     @abstractmethod
     def lowest(self, pencil: P, k: int, report: Report = silent) -> RawPairs:
-        """Return the k lowest eigenvalues, ascending, M-orthonormal eigenvectors as rows, and a bound.
+        """Return the k lowest eigenvalues (ascending), M-orthonormal eigenvectors (as rows), and a certified bound.
 
-        None of the k lowest eigenvalues is missing below the bound. Missing pairs are NaN, and the bound is NaN if
-        there is no certificate. The method works under `jit` and `vmap`; outside `jit`, it may report progress.
+        None of the k lowest eigenvalues is missing below the bound. Pairs that were not found are NaN, and the bound is
+        NaN if there is no certificate. The method works under `jit` and `vmap`; outside `jit`, it may report progress.
         """
 
     def guards(self, k: int, n_dof: int) -> int:
@@ -83,7 +84,7 @@ class Eigensolver(eqx.Module, Generic[P]):
 
 
 class Dense(Eigensolver[SymmetricPencil]):
-    """The dense solver: `eigh` of L⁻¹KL⁻ᵀ, where M = LLᵀ, in O(n³) time and O(n²) memory. It misses no eigenvalue.
+    """The dense solver, which misses no eigenvalue: `eigh` of L⁻¹KL⁻ᵀ, where M = LLᵀ, in O(n³) time and O(n²) memory.
 
     Examples:
         >>> flat = hj.TensorField(field.grid, np.tile(np.eye(2), (9, 9, 1, 1)))
@@ -95,7 +96,7 @@ class Dense(Eigensolver[SymmetricPencil]):
     tolerance: float = eqx.field(default=1e-8, static=True)
 
     def lowest(self, pencil: SymmetricPencil, k: int, report: Report = silent) -> RawPairs:
-        """Return the k lowest eigenpairs. For concrete values, SciPy computes them, without compilation."""
+        """Return the k lowest eigenpairs, which SciPy computes without compilation if values are concrete."""
         if not is_concrete_on_cpu(pencil):
             return _dense(pencil.stiffness.to_dense(), pencil.mass.to_dense(), k)
         data, matrices = host_matrices(pencil)

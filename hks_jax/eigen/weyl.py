@@ -35,14 +35,14 @@ def weyl_count(
     """Estimate the number of eigenvalues below each of several values, by Weyl's law.
 
     In 2D, N(λ) ≈ (A λ ± L √λ)/4π, where A is the area and L is the length of the boundary. In 3D, N(λ) ≈ V λ^(3/2)/6π²
-    ± S λ/16π, where V is the volume and S is the area of the boundary. The sign is plus for a natural boundary, and
-    minus for a Dirichlet boundary (Ivrii 1980). For a mask, L and S measure the staircase of element faces.
-    Eigenfunctions resolve its steps only if √λ times the spacing is close to 1.
+    ± S λ/16π, where V is the volume and S is the area of the boundary. The boundary term is positive for a natural
+    boundary, and negative for a Dirichlet boundary (Ivrii 1980). For a mask, L or S is the measure of a staircase of
+    element faces, whose steps eigenfunctions resolve only if √λ times the node spacing is close to 1.
 
     Args:
         problem: the result of `eigenpairs` or `assemble`, which has volume, dimension and boundary conditions.
         values: (n,) λ ≥ 0, in 1/(metric length)².
-        domain: the field or mesh of the problem, which the second term needs. None omits the second term.
+        domain: the field or mesh of the problem, from which the boundary term is computed; None omits this term.
 
     Returns:
         (n,) estimates, as a NumPy array.
@@ -58,7 +58,7 @@ def weyl_count(
     d = pencil.space.dimension
     volume = pencil.volume if pencil.measured else None
     if volume is None:
-        raise ValueError("problem: got matrices without dimension or volume; give these to `sparse_pencil`")
+        raise ValueError("problem: got matrices without dimension or volume; give `sparse_pencil` both numbers")
     if any(part.metric is not None and part.null_space is None for part in pencil.parts):
         raise ValueError("problem: got an operator with a potential, which Weyl's law omits; use `count_eigenvalues`")
     require_real("values", values)
@@ -98,7 +98,7 @@ def _grid_rim(field: TensorField, space: GridSpace, axis: int) -> float:
     others = [a for a in range(d) if a != axis]
     tensors = np.asarray(field.domain_tensors, np.float64)[..., others, :][..., others]
     density = wrap_nodes(np.sqrt(np.linalg.det(tensors)), space.periodic)
-    # Integrate over each face by the trapezoidal rule; along the axis, the index remains the index of a node.
+    # Integrate over each face by the trapezoidal rule in the other axes; along ``axis``, entries remain nodal values.
     for a in others:
         n = density.shape[a]
         density = (density.take(range(n - 1), a) + density.take(range(1, n), a)) / 2

@@ -64,9 +64,9 @@ def assemble(
         stiffness: your own form, which replaces potential and density: a function ``form(u, v, w)`` that is linear in u
             and in v and returns one number. The shape functions u and v have ``.value`` and ``.grad``. The point w has
             the metric ``.metric`` (d, d), its inverse ``.inverse``, the position ``.x`` and the fields ``w["name"]``.
-            The number is integrated with the volume element √|T| dx. On meshes, gradients and metric have components
-            along the axes of space; on a surface, gradients and metric are tangential. Define a form once: each new
-            function is compiled anew (docs/operators.md).
+            The number that `form` returns is integrated with the volume element √|T| dx. On meshes, gradients and
+            metric have components along the axes of space; on a surface, gradients and metric are tangential. Define a
+            form once: each new function is compiled anew (docs/operators.md).
         fields: the fields that your forms read, by name; they may have further axes after those of nodes or elements.
         components: the number c of components of a function. For c > 1, as in elasticity, ``u.value`` is (c,),
             ``u.grad`` is (c, d) with ``grad[i, j]`` = ∂uᵢ/∂xⱼ, and results have an axis of length c after those of the
@@ -76,8 +76,9 @@ def assemble(
         midpoints: for degree 2, the positions (E, 3) of the edges' midpoints, which curve the edges; or a function from
             the midpoint of a straight edge to its new position. On a `TetMesh` the function moves boundary edges only.
         quadrature: ``"gauss"`` or, on grids, ``"cancelling"``: points for which the leading error of heat kernel
-            signatures cancels (docs/accuracy.md). The mass is then consistent, and the unknowns φ are not nodal values:
-            all signatures compute nodal values as ½(I + D⁻¹M)φ, where the diagonal matrix D has the row sums of M.
+            signatures cancels (docs/accuracy.md). With ``"cancelling"``, the mass is consistent, and the unknowns φ are
+            not nodal values: signatures compute nodal values as ½(I + D⁻¹M)φ, where the diagonal matrix D holds the row
+            sums of M.
 
     Returns:
         The pencil (stiffness, mass). With ``"mirror"`` and ``"mean"`` the result is the `MirrorPencil` of the problems

@@ -19,14 +19,14 @@ BoundarySpec: TypeAlias = str | tuple[str | Sides, ...]
 _SIDE_BY_SIDE = ("neumann", "dirichlet", "mean")
 _CONDITIONS = (*_SIDE_BY_SIDE, "periodic", "mirror")
 _WHOLE_RIM = {"mean": "mean", "dirichlet-rim": "dirichlet"}
-"""The condition that each of these names, if given alone, sets on all sides and on the rim of a mask."""
+"""Names that set one condition on all sides and on the rim of a mask, if `boundary` is the name, and this condition."""
 
 
 def normalise_boundary(boundary: BoundarySpec, dimension: int) -> tuple[Sides, ...]:
-    """Return a pair of conditions (low, high) for every axis, and a pair that repeats the condition on a mask's rim.
+    """Return a pair of conditions (low, high) for each axis; a last pair repeats the condition on the rim of a mask.
 
-    `assemble` describes the argument. By default, the rim's condition is ``"mean"`` if an axis has this condition, and
-    natural otherwise.
+    `assemble` describes the argument `boundary`. If `boundary` has no entry for the rim of a mask, the condition on the
+    rim is ``"mean"`` if an axis has the mean condition, and natural otherwise.
     """
     if isinstance(boundary, str):
         everywhere = _WHOLE_RIM.get(boundary)
@@ -68,8 +68,9 @@ def _pair(entry: str | Sides) -> Sides:
 def default_boundary(inside: Bool[np.ndarray, "*shape"]) -> tuple[str, str]:
     """Return the boundary condition that suits a domain, and the reason.
 
-    The condition is ``"mean"`` if the domain has a mask with inner nodes, since the natural condition on the rim would
-    dominate signatures. The command line uses this condition by default; the library's functions use ``"neumann"``.
+    The suitable condition is ``"mean"`` for a domain whose mask has inner nodes, because the natural condition doubles
+    signatures beside the rim of the mask. The command line uses `default_boundary`; the functions of the library use
+    ``"neumann"`` by default.
 
     Args:
         inside: (*shape) the nodes of the domain, such as `Grid.inside`.
@@ -83,15 +84,15 @@ def default_boundary(inside: Bool[np.ndarray, "*shape"]) -> tuple[str, str]:
     every_axis = (False,) * inside.ndim
     elements = active_elements(inside, every_axis)
     free = element_nodes(elements, every_axis) & ~rim_nodes(elements, every_axis)
-    if not free[(slice(1, -1),) * inside.ndim].any():  # the Dirichlet problem eliminates the grid's sides, too
+    if not free[(slice(1, -1),) * inside.ndim].any():  # the mean needs nodes away from sides and rim
         return "neumann", "the mask is so thin that all voxels are on the rim, but the mean needs inner voxels"
-    return "mean", 'the domain has a mask; pass boundary="neumann" for a natural rim'
+    return "mean", 'the domain has a mask; for the natural condition on its rim, pass boundary="neumann"'
 
 
 def unreached_sides(inside: Bool[np.ndarray, "*shape"], boundary: BoundarySpec) -> list[str]:
     """Return a warning for each condition on a side of the grid that the mask does not reach."""
     *axes, (rim, _) = normalise_boundary(boundary, inside.ndim)
-    own = 'is natural, unless you pass "dirichlet-rim" or "mean"' if rim == "neumann" else f'has "{rim}"'
+    own = 'has the natural condition, unless you pass "dirichlet-rim" or "mean"' if rim == "neumann" else f'has "{rim}"'
     return [
         f'boundary: "{condition}" has no effect at the {side} side of {name}, which the mask does not reach; '
         f"the rim of the mask {own}"
@@ -104,10 +105,11 @@ def unreached_sides(inside: Bool[np.ndarray, "*shape"], boundary: BoundarySpec) 
 def doubled_problems(boundary: tuple[Sides, ...]) -> list[tuple[Sides, ...]]:
     """Return the problems whose spectra together are the spectrum of a domain doubled by ``"mirror"`` or ``"mean"``.
 
-    Functions on the doubled, periodic axis are even or odd about both mirrors. At the mirrors, even functions satisfy
-    the Neumann condition, and odd functions vanish. So a mirror axis gives a Neumann and a Dirichlet problem, and m
-    mirror axes give 2^m problems. Likewise, functions on two copies of a domain that are glued along the rim are even
-    (Neumann) or odd (Dirichlet). In the first problem, functions are even under all reflections.
+    On an axis doubled by ``"mirror"``, functions are sums of an even and an odd function about the mirrors at both
+    sides. Even functions satisfy the Neumann condition at a mirror, and odd functions vanish. A mirrored axis therefore
+    gives a Neumann and a Dirichlet problem, and m mirrored axes give 2^m problems. On two copies of a domain glued
+    along the rim by ``"mean"``, functions are sums of an even (Neumann) and an odd (Dirichlet) function. The first
+    problem in the list has the functions that are even under all reflections.
     """
     choices = [
         [("neumann", "neumann"), ("dirichlet", "dirichlet")] if sides == ("mirror", "mirror") else [sides]
@@ -121,10 +123,10 @@ def doubled_problems(boundary: tuple[Sides, ...]) -> list[tuple[Sides, ...]]:
 
 
 def reflect(field: TensorField, width: int) -> TensorField:
-    """Extend a field by a strip of its mirror image on every side, as in the paper; `crop` removes the strip.
+    """Extend a field by a mirrored strip on every side, as Zobel, Reininghaus and Hotz do; `crop` removes the strips.
 
-    A reflection is an isometry only if the off-diagonal components across the mirror change sign. So in the strip
-    beyond a side of axis a, Tₐᵦ is negated for b ≠ a. The mask, if any, is reflected too.
+    A reflection is an isometry only if the off-diagonal components of the tensors across the mirror change sign. In the
+    strip beyond a side of axis a, the tensor components Tₐᵦ with b ≠ a are negated. `reflect` also reflects a mask.
 
     Args:
         field: the field on a grid of shape (n₁, …).

@@ -1,4 +1,4 @@
-"""Elements: shape functions at quadrature points, element matrices, and points for which errors cancel."""
+"""Elements: shape functions at quadrature points, element matrices, and points that cancel an error of signatures."""
 
 import math
 from collections.abc import Mapping
@@ -72,20 +72,19 @@ def tensor_product_element(dimension: int, point: float = GAUSS) -> Element:
     return Element(reduce(np.kron, [h] * dimension), np.stack(gradients, axis=-1), np.full(n, 1 / n))
 
 
-# Each of the d + 1 points has the same weight, one barycentric coordinate 1 − d·a, and d coordinates a. The rule is
-# exact for polynomials of degree two if the product of two different coordinates has the mean 1/((d + 1)(d + 2)) over
-# the points. Then 2a(1 − d·a) + (d − 1)a² = 1/(d + 2), and the smaller solution a is ``beside``.
+# The d + 1 quadrature points have equal weights. One barycentric coordinate of each quadrature point is 1 − d·a, and
+# the other d coordinates equal a. The rule is exact for polynomials of degree two if the product of two coordinates has
+# the mean 1/((d + 1)(d + 2)) over the points: 2a(1 − d·a) + (d − 1)a² = 1/(d + 2), where the smaller a is ``beside``.
 def _linear_rule(d: int) -> tuple[Float[np.ndarray, "q n"], Float[np.ndarray, " q"]]:
-    """Return the barycentric coordinates and weights of a rule that is exact for degree two."""
     beside = (d + 2 - math.sqrt(d + 2)) / ((d + 1) * (d + 2))
     points = np.full((d + 1, d + 1), beside) + (1 - (d + 1) * beside) * np.eye(d + 1)
     return points, np.full(d + 1, 1 / math.factorial(d + 1))
 
 
-# Radon's rule has 7 points in a triangle, and Keast's has 15 points in a tetrahedron: the centre, one point near each
-# corner, one near the centre of each side and, in 3D, one near the midpoint of each edge.
+# Radon's rule has 7 points in a triangle: the centre, three points near the corners and three near the midpoints of the
+# edges. Keast's rule has 15 points in a tetrahedron: the centre, four points near the corners, four near the centres of
+# the faces and six near the midpoints of the edges. Radon's and Keast's rules are exact for polynomials of degree five.
 def _quadratic_rule(d: int) -> tuple[Float[np.ndarray, "q n"], Float[np.ndarray, " q"]]:
-    """Return the barycentric coordinates and weights of a rule that is exact for degree five."""
     root, n = math.sqrt(15), d + 1
     points, weights = [np.full((1, n), 1 / n)], [[9 / 80 if d == 2 else 8 / 405]]
     for sign in (1, -1):
@@ -123,32 +122,38 @@ def simplex_element(dimension: int, degree: int = 1) -> Element:
 Quadrature = Literal["gauss", "cancelling"]
 
 MASS = math.sqrt(2 / 3)
-"""The coordinate ξ of the points ±ξ on each axis of [−1, 1]^d where the mass evaluates shape functions."""
+"""The coordinate ξ of the points ±ξ on each axis of [−1, 1]^d at which a cancelling mass evaluates shape functions."""
 _LEAST, _GREATEST = 0.01, 1.0
-"""Bounds of ξ² for the stiffness. They keep points in the cell, but off its centre, where hourglass modes have no
-energy."""
+"""Bounds of ξ² that keep the quadrature points of the stiffness inside the cell, but away from its centre, where
+hourglass modes (alternating nodal values) have no energy."""
 
 
-# Let T be a constant tensor, A = T⁻¹, hₐ the spacing along axis a, k the wave vector of a plane wave, and θₐ = kₐhₐ.
-# For points ±ξ and μ = (1 − ξ²)/4, the mass along one axis has the symbol 1 − μθ² + O(θ⁴). In the stiffness, a product
-# of two derivatives has the symbol k²(1 − θ²/12), and a derivative times a value has (sin θ)/h for every ξ. Let ν be
-# the stiffness's μ for axes without a derivative. To leading order, the eigenvalue λ = Σ Aₐᵦkₐkᵦ becomes
+# Derivation for a constant tensor T = A⁻¹: on a grid with the spacing hₐ along axis a, a plane wave with the wave
+# vector k changes its phase by θₐ = kₐhₐ between neighbouring nodes. The symbol of a matrix is the factor by which the
+# matrix multiplies a plane wave. If the mass has the quadrature points ±ξ, its symbol along one axis is 1 − μθ² +
+# O(θ⁴), where μ = (1 − ξ²)/4. In the stiffness, a product of two derivatives has the symbol k²(1 − θ²/12), and a
+# derivative times a value has the symbol (sin θ)/h, both for every ξ. Along an axis without a derivative, the stiffness
+# has the symbol 1 − νθ² + O(θ⁴), where ν = (1 − ξ²)/4 for the points ±ξ of the stiffness. The exact eigenvalue of the
+# wave is λ = Σ Aₐᵦkₐkᵦ, and its discrete eigenvalue is, to leading order,
 #
 #     λ + λ μ Σₐ θₐ² − Σₐ Aₐₐkₐ² (θₐ²/12 + ν Σ_{b≠a} θᵦ²) − Σ_{a<b} 2Aₐᵦkₐkᵦ ((θₐ² + θᵦ²)/6 + ν Σ_{c≠a,b} θ_c²).
 #
-# For μ = ν = 1/12 the error −Σ_{a<b} 2Aₐᵦkₐkᵦ (θₐ² + θᵦ²)/12 remains, which is zero for a diagonal tensor. For other
-# tensors, no stencil with 3^d couplings cancels the error for every k. But ν = 1/12 + δ cancels the mean of the error
-# over the heat kernel. In this mean, θ is normal with a covariance proportional to Sₐᵦ = hₐhᵦTₐᵦ. Let A now be the
-# inverse of S. Isserlis' theorem E θₐθᵦθ_cθ_e = SₐᵦS_ce + Sₐ_cSᵦ_e + Sₐ_eSᵦ_c gives
+# With the coefficients μ = 1/12 of the mass and ν = 1/12 of the stiffness, the eigenvalue has the error
+# −Σ_{a<b} 2Aₐᵦkₐkᵦ (θₐ² + θᵦ²)/12, which is zero for a diagonal tensor. For a tensor that is not diagonal, no stencil
+# with 3^d couplings cancels the error of every plane wave. But the coefficient ν = 1/12 + δ of the stiffness cancels
+# the mean of the error over the heat kernel, in which the phases θ are normally distributed with a covariance
+# proportional to Sₐᵦ = hₐhᵦTₐᵦ. Since θₐ = hₐkₐ, Aₐᵦkₐkᵦ = Bₐᵦθₐθᵦ with B = S⁻¹. Isserlis' theorem for
+# expectations, E θₐθᵦθ_cθ_e = SₐᵦS_ce + Sₐ_cSᵦ_e + Sₐ_eSᵦ_c, gives the correction
 #
-#     δ = −(1/12) Σ_{a<b} 2Aₐᵦ E(θₐ³θᵦ + θₐθᵦ³) / (Σ_{a≠b} Aₐₐ E θₐ²θᵦ² + Σ_{a<b} Σ_{c≠a,b} 2Aₐᵦ E θₐθᵦθ_c²);
+#     δ = −(1/12) Σ_{a<b} 2Bₐᵦ E(θₐ³θᵦ + θₐθᵦ³) / (Σ_{a≠b} Bₐₐ E θₐ²θᵦ² + Σ_{a<b} Σ_{c≠a,b} 2Bₐᵦ E θₐθᵦθ_c²).
 #
-# δ depends neither on t nor on the size of S. In two dimensions δ = S₁₂²/2(S₁₁S₂₂ + 2S₁₂²), so that ξ² = 2/3 − 4δ is
-# between 0 and 2/3. The denominator is positive: it equals Σ_c E(θ_c² Σ_{a,b≠c} Aₐᵦθₐθᵦ).
+# The correction δ depends neither on the time t nor on the size of the matrix S. In two dimensions
+# δ = S₁₂²/2(S₁₁S₂₂ + 2S₁₂²), so that ξ² = 2/3 − 4δ for the points ±ξ of the stiffness is between 0 and 2/3. The
+# denominator of the correction is positive, because it equals the expectation Σ_c E(θ_c² Σ_{a,b≠c} Bₐᵦθₐθᵦ).
 #
-# The nodal values of functions of norm 1 are too large by the factor 1 + Σ μθₐ²/2, which `Pencil.read` corrects.
+# The mass makes nodal values of functions of norm 1 too large by the factor 1 + Σ μθₐ²/2, which `Pencil.read` corrects.
 def stiffness_point(metric: Float[Array, "d d"], spacing: Float[np.ndarray | Array, " d"]) -> Float[Array, ""]:
-    """Return ξ² of the quadrature points of the stiffness in a cell with this metric."""
+    """Return ξ² for the quadrature points ±ξ of the stiffness in a cell with this metric."""
     s = metric * spacing[:, None] * spacing
     d = len(s)
     s = d * s / jnp.trace(s)
@@ -163,17 +168,17 @@ def stiffness_point(metric: Float[Array, "d d"], spacing: Float[np.ndarray | Arr
     return jnp.clip(2 / 3 + numerator / (3 * denominator), _LEAST, _GREATEST)
 
 
-# Only the shape functions are evaluated at the points ±ξ. Tensors are evaluated at Gauss points, which integrate
-# tensors accurately. With tensors evaluated at the points ±ξ, errors on brains were twice as large.
+# The stiffness evaluates shape functions at its quadrature points ±ξ, but tensors at Gauss points, which integrate
+# tensors accurately. With tensors at the points ±ξ, the errors of signatures of brain images were twice as large.
 #
 # On a cell, a function is a linear combination of products of coordinates, one for each set of axes. The derivative of
-# a product of m coordinates is a product of m − 1 coordinates, which are ±ξ at the points. So the stiffness for points
-# ±ξ follows from the stiffness for Gauss points ±ξ₀, if the derivative of each product is multiplied by (ξ/ξ₀)^(m−1).
-# The products are orthogonal, because their values at the corners are ±1.
+# a product of m coordinates is a product of m − 1 coordinates, which are ±ξ at the quadrature points. If the derivative
+# of each product of m coordinates is multiplied by (ξ/ξ₀)^(m−1), the stiffness for Gauss points ±ξ₀ becomes the
+# stiffness for points ±ξ. The products of coordinates are orthogonal, because their values at the corners are ±1.
 def moved(
     stiffness: Float[Array, "n n"], metric: Float[Array, "q d d"], spacing: Float[np.ndarray | Array, " d"]
 ) -> Float[Array, "n n"]:
-    """Convert a cell's stiffness for Gauss points into the stiffness for the points of `stiffness_point`."""
+    """Convert the stiffness of a cell from Gauss points to the quadrature points that `stiffness_point` determines."""
     ratio = jnp.sqrt(stiffness_point(jnp.mean(metric, axis=0), spacing)) / GAUSS
     basis, powers = (jnp.asarray(each, stiffness.dtype) for each in _products_of_coordinates(len(spacing)))
     factors = ratio**powers
@@ -183,7 +188,6 @@ def moved(
 
 @lru_cache(maxsize=2)
 def _products_of_coordinates(dimension: int) -> tuple[Float[np.ndarray, "nn nn"], Float[np.ndarray, " n"]]:
-    """Return the transform of matrices to the basis of products of m coordinates, and max(m − 1, 0) for each one."""
     one = np.array([[1.0, 1.0], [1.0, -1.0]]) / np.sqrt(2)
     basis = reduce(np.kron, [one] * 2 * dimension)
     degrees = np.indices((2,) * dimension).sum(axis=0).ravel()

@@ -132,16 +132,16 @@ for _unknown in (
 class _State(eqx.Module):
     """A factorised operator A."""
 
-    factor: FactorisedMatrix  # of A or, if A is complex, of the real symmetric matrix of its real and imaginary part
+    factor: FactorisedMatrix  # the factors of A, or of a real matrix of twice the size if A is complex
     hermitian: bool | None = eqx.field(static=True)  # whether a complex A is Hermitian, not symmetric; None if real
-    conjugate: bool = eqx.field(static=True, default=False)  # whether the state stands for the conjugate of A
+    conjugate: bool = eqx.field(static=True, default=False)  # whether `solve` uses the conjugate of A
 
     def conjugated(self) -> "_State":
         return _State(self.factor, self.hermitian, self.hermitian is not None and not self.conjugate)
 
-    # Let A = R + iS, x = u + iv and b = c + id. Then A x = b means R u − S v = c and S u + R v = d. If A is Hermitian,
-    # S is antisymmetric, and the matrix of this system is symmetric. If A is symmetric, the system becomes symmetric
-    # when the second equation changes sign.
+    # For A = R + iS, x = u + iv and b = c + id, the complex system A x = b stands for two real systems, R u − S v = c
+    # and S u + R v = d. If A is Hermitian, S is antisymmetric, and the block matrix of the two real systems is
+    # symmetric. If A is symmetric, the block matrix becomes symmetric when the second real system changes sign.
     def solve(self, b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
         if self.hermitian is None:
             return self.factor.solve(b)

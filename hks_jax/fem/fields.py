@@ -19,8 +19,8 @@ Place = Literal["everywhere", "nodes", "elements", "points"]
 class Field(eqx.Module):
     """A field on the elements of a domain."""
 
-    values: Float[Array, "..."]  # (…), (*node_shape, …), (*elements, …), or (*elements, q, …) at quadrature points
-    at: Place = eqx.field(static=True)  # the kind of places that have a value
+    values: Float[Array, "..."]  # one value (…), or values (*node_shape, …), (*elements, …) or (*elements, q, …)
+    at: Place = eqx.field(static=True)  # where the values are given; "points" are quadrature points
 
     def at_points(
         self, corners: Callable[[Array], Array], shape_values: Float[np.ndarray, "q n"], elements: tuple[int, ...]
@@ -91,7 +91,6 @@ def checked_field(
 def _placed(
     name: str, given: Any, space: FunctionSpace, positions: Callable[[], Float[Array, "*elements q m"]]
 ) -> tuple[Array, Place, Bool[np.ndarray, "..."] | None]:
-    """Return the values of a field, the kind of places that have them, and which places are in the domain."""
     nodes, elements = space.node_shape, space.elements
     if callable(given):
         x = positions()

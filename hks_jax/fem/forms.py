@@ -1,7 +1,7 @@
 """Weak forms, the integrands of stiffness and mass, and their integrals over one element.
 
-A form is a function of two shape functions u and v and of a point w. It is bilinear and symmetric in u and v, written
-as in scikit-fem, and integrated with the volume element √|T| dx of the metric T.
+A form is a function of two shape functions u and v and of a point w, written as in scikit-fem. A form is bilinear and
+symmetric in u and v, and is integrated with the volume element √|T| dx of the metric T.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,20 +18,20 @@ from hks_jax.linear.operators import ROUNDING
 class ShapeFunction(NamedTuple):
     """A shape function at a point."""
 
-    value: Float[Array, "*c"]  # its value, (), or (c,) for c components
-    grad: Float[Array, "*c d"]  # its derivatives by the coordinates x, (d,); or (c, d) with ``grad[i, j]`` = ∂uᵢ/∂xⱼ
+    value: Float[Array, "*c"]  # the value of the function, (), or (c,) for c components
+    grad: Float[Array, "*c d"]  # the derivatives with respect to x, (d,); or (c, d) with ``grad[i, j]`` = ∂uᵢ/∂xⱼ
 
 
 class Point(eqx.Module):
-    """A point with the metric and the fields there; on a surface in space, the tensors act on the tangent plane."""
+    """A point with the values of metric and fields; on a surface in space, the tensors act on the tangent plane."""
 
     metric: Float[Array, "*q d d"]  # the tensor T
-    inverse: Float[Array, "*q d d"]  # its inverse
+    inverse: Float[Array, "*q d d"]  # the inverse of the tensor T
     x: Float[Array, "*q m"] | None  # coordinates on a grid, a point in space on a mesh, None for the package's forms
     fields: Mapping[str, Array]  # the values of the user's fields; ``w["name"]`` reads one
 
     def __getitem__(self, name: str) -> Array:
-        """Return a field at this point."""
+        """Return the value of the field with this name at the point."""
         if name not in self.fields:
             there = ", ".join(map(repr, self.fields)) or "none"
             raise ValueError(f"fields: a form reads {name!r}; the fields are {there}. Pass fields={{{name!r}: …}}")
@@ -59,7 +59,7 @@ def _weighted(density: Array, w: Point) -> Array:
 
 
 class WeakForm(NamedTuple):
-    """The forms of stiffness and mass, and how they are assembled; static."""
+    """The forms of stiffness and mass, and the settings of their assembly; all are static arguments of `jax.jit`."""
 
     stiffness: Form = laplace_beltrami
     mass: Form = l2
@@ -71,7 +71,7 @@ class WeakForm(NamedTuple):
 
 
 def of_components(functions: ShapeFunction, components: int) -> ShapeFunction:
-    """Return vector functions (q, n·c, c): one of n given functions in one of c components, and 0 in the others."""
+    """Return n·c functions with c components each: one of n scalar functions as one component, and 0 as the others."""
     if components == 1:
         return functions
     (h, dh), eye = functions, jnp.eye(components, dtype=functions.value.dtype)
@@ -80,13 +80,15 @@ def of_components(functions: ShapeFunction, components: int) -> ShapeFunction:
     return ShapeFunction(value.reshape(q, n, components), grad.reshape(q, n, components, -1))
 
 
-# A form is linear in u, so that form(u, v, w) is the inner product of flux(v) with the value and gradient of u. The
-# transpose of the form gives the flux, which is T⁻¹∇v for the form T⁻¹∇u·∇v. So n evaluations suffice for n² pairs.
+# For each v, a form is a linear function of the value and the gradient of u. The coefficients of this linear function
+# are the flux of v, such as T⁻¹∇v for the form T⁻¹∇u·∇v; JAX computes the flux by transposing the form. The fluxes of n
+# shape functions therefore suffice for the integrals over all n² pairs of shape functions.
 def integrate(form: Form, volume: Float[Array, " q"], functions: ShapeFunction, points: Point) -> Float[Array, "n n"]:
-    """Integrate a form over one element, for all pairs of n shape functions: value (q, n, *c), grad (q, n, *c, d).
+    """Integrate a form over one element, for all n² pairs of n shape functions.
 
-    Each of the q entries of ``volume`` is the weight of a quadrature point times √|T|. A form that does not return one
-    number, or that is not linear in u, raises ValueError.
+    The shape functions have values (q, n, *c) and gradients (q, n, *c, d) at q quadrature points. Each of the q entries
+    of ``volume`` is the weight of a quadrature point times √|T|. A form that does not return one number, or that is not
+    linear in u, raises ValueError.
     """
     read = _reads(form, *(jax.tree.map(lambda leaf: leaf[0], each) for each in (functions, points)))
 

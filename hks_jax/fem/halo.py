@@ -43,7 +43,7 @@ def side_by_side(coefficients: Float[Array, "offsets *shape"]) -> Float[Array, "
 def product_with_rim(
     coefficients: Float[Array, "offsets *shape"],
 ) -> Callable[[Float[Array, "*rimmed b"]], Float[Array, "*shape b"]]:
-    """Return the function that multiplies columns, padded by `with_rim`, by a stencil."""
+    """Return the function that applies a stencil to columns that `with_rim` has padded."""
     shape, together = coefficients.shape[1:], side_by_side(coefficients)
 
     def apply(x: Float[Array, "*rimmed b"]) -> Float[Array, "*shape b"]:
@@ -120,16 +120,16 @@ class Slabs:
         return PartitionSpec(*[None] * axis, self.name)
 
     def split(self, x: Any, axis: int = 0) -> Array:
-        """Pad an array whose ``axis`` is the first axis of the grid, and place each slab on its device.
+        """Pad an array along ``axis``, the first axis of the grid, and place one slab of the array on each device.
 
-        If there are several processes, each passes the whole array.
+        In a program with several processes, each process passes the whole array.
         """
         if is_traced(x):
             return jax.lax.with_sharding_constraint(self._padded(x, axis), NamedSharding(self.mesh, self.spec(axis)))
         return jax.jit(self._padded, static_argnums=1, out_shardings=NamedSharding(self.mesh, self.spec(axis)))(x, axis)
 
     def join(self, x: Array, axis: int = 0) -> Array:
-        """Remove the padding. If there was padding, every device holds the whole result."""
+        """Remove the padding of `split`. If there was padding, every device holds the whole result."""
         return jax.lax.slice_in_dim(x, 0, self.shape[0], axis=axis)
 
     @partial(jax.jit, static_argnums=0)
@@ -162,7 +162,7 @@ class Slabs:
     # The methods below are called inside `shard_map`, on the slab of one device.
 
     def with_halo(self, x: Float[Array, "*slab b"]) -> Float[Array, "*rimmed b"]:
-        """Return the slab with the adjacent planes of its neighbours, and padded along the other axes."""
+        """Return the slab with the adjacent planes of the neighbouring slabs, padded along the other axes."""
         last, planes = divmod(self.shape[0] - 1, self.thickness)
         up = [(i, i + 1) for i in range(last)]
         down = [(i + 1, i) for i in range(last)]

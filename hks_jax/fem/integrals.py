@@ -141,15 +141,12 @@ def _grid_integrals(
     interpolation: Interpolation,
     operator: WeakForm,
 ) -> tuple[Array, Array, Array, Array]:
-    """Return stiffness and mass as stencils, the row sums of the mass at all nodes, and the volume.
-
-    For functions with several components, return the element matrices in place of stencils.
-    """
+    """Return stiffness and mass as stencils (as element matrices for vectors), the mass's row sums and the volume."""
     element = Element(tensor_product_element(len(periodic)).values, gradients, weights)
     tensors = spd.positive_or_nan(spd.identity_outside(tensors, domain))
 
-    # Logarithms are computed at the nodes, and exponentials at the quadrature points. The barriers keep the compiler
-    # from fusing the exponentials into each use of a component, and so from repeating the exponentials.
+    # Logarithms of tensors are computed at the nodes, and exponentials at the quadrature points. Optimization barriers
+    # keep the compiler from computing an exponential again wherever one of its components is used.
     nodal = tensors if interpolation == "linear" else spd.log(tensors)
     at_corners = partial(_at_corners, periodic=periodic)
     at_points = partial(Field.at_points, corners=at_corners, shape_values=element.values, elements=elements.shape)
@@ -189,7 +186,6 @@ def _grid_integrals(
 
 
 def _at_corners(nodal: Float[Array, "*shape_and_rest"], periodic: tuple[bool, ...]) -> Float[Array, "E n ..."]:
-    """Gather nodal values at the corners of every element."""
     d, rest = len(periodic), nodal.shape[len(periodic) :]
     nodes = jnp.pad(nodal, [*[(0, int(wraps)) for wraps in periodic], *[(0, 0)] * len(rest)], mode="wrap")
     corners = [nodes[corner] for corner in product(*[(slice(None, -1), slice(1, None))] * d)]
@@ -197,13 +193,10 @@ def _at_corners(nodal: Float[Array, "*shape_and_rest"], periodic: tuple[bool, ..
 
 
 def _stencil(matrices: Float[Array, "*elements n n"], periodic: tuple[bool, ...]) -> Float[Array, "offsets *shape"]:
-    """Assemble element matrices into 3^d coefficients per node.
-
-    Entry (a, b) of an element matrix couples the node at corner a to the node at offset b − a.
-    """
+    """Assemble element matrices, whose entry (a, b) couples the node at corner a to the node at offset b − a."""
     d = len(periodic)
     couplings = jnp.moveaxis(matrices, (-2, -1), (0, 1)).reshape(2**d, *(2,) * d, *matrices.shape[:d])
-    # In 3D, one pad for each a and all corners b compiles twice as fast as one pad for each pair (a, b).
+    # In 3D, one `pad` for each corner a, with all corners b, compiles twice as fast as one `pad` for each pair (a, b).
     total = jnp.zeros((), matrices.dtype)
     for a, node in enumerate(product((0, 1), repeat=d)):
         total = total + jnp.pad(couplings[a], [(1 - i, i) for i in node] + [(i, 1 - i) for i in node])
@@ -238,7 +231,7 @@ def mesh_nodes(mesh: SimplicialMesh, degree: int, midpoints: Any) -> Float[Array
     if moved.shape != middles.shape:
         raise ValueError(
             f"midpoints: got shape {moved.shape}; expected {middles.shape}, one position for each edge of "
-            "mesh.triangulation.edges, or a function that maps a position (3,) to another one"
+            "mesh.triangulation.edges, or a function that maps an edge's midpoint (3,) to its new position"
         )
     return jnp.concatenate([vertices, moved.astype(vertices.dtype)])
 

@@ -26,7 +26,7 @@ class NodalPencil(eqx.Module):
 
     stiffness: Stencil  # K
     mass: Stencil  # M; a diagonal if lumped
-    lumped: Float[Array, "*shape"]  # the row sums D of M, without derivatives; 1 at nodes that are not free
+    lumped: Float[Array, "*shape"]  # the row sums D of M as constants; 1 at nodes that are not free
     free: Bool[Array, "*shape"]  # the nodes that carry a degree of freedom
     domain: Bool[Array, "*shape"]  # the nodes of the domain: free nodes, and nodes where functions vanish
 
@@ -46,7 +46,7 @@ class NodalPencil(eqx.Module):
         return jnp.where(self.free, self.lumped, 0)
 
     def cut(self, mesh: Mesh | None) -> Slabs | None:
-        """Return how the grid is divided among several devices; None for one device."""
+        """Return the division of the grid into slabs for the devices of a mesh; None for a single device."""
         return None if mesh is None else Slabs(mesh, self.shape, self.periodic)
 
     def own(self, slabs: Slabs | None) -> "NodalPencil":
@@ -66,13 +66,14 @@ class NodalPencil(eqx.Module):
 
         return both
 
-    # P is p(D⁻¹M)D⁻¹ with a fixed polynomial p of degree m − 1, and so linear and symmetric. If μ is in the spectrum
-    # [low, 1] of D⁻¹M, |1 − μ p(μ)| ≤ 1/T_m(σ), where σ = (1 + low)/(1 − low). The upper end is 1 by Gershgorin's
-    # theorem, since the entries of M are not negative.
+    # Chebyshev iteration with m steps computes P = p(D⁻¹M)D⁻¹ with a fixed polynomial p of degree m − 1; P is therefore
+    # linear and symmetric. For an eigenvalue μ of D⁻¹M in [low, 1], |1 − μ p(μ)| ≤ 1/T_m(σ), where T_m is a Chebyshev
+    # polynomial and σ = (1 + low)/(1 − low). The eigenvalues of D⁻¹M are at most 1 by Gershgorin's theorem, since the
+    # entries of M are not negative.
     def mass_solve(
         self, low: Float[Array, ""] | float, degree: int
     ) -> Callable[[Float[Array, "*shape b"]], Float[Array, "*shape b"]]:
-        """Return r ↦ Pr, where P ≈ M⁻¹ is ``degree`` steps of Chebyshev iteration, or exactly M⁻¹ if M is lumped."""
+        """Return r ↦ Pr, where P is M⁻¹ for a lumped M, or else approximates M⁻¹ by ``degree`` Chebyshev steps."""
         inverse, mass = 1 / self.lumped[..., None], self.mass.of_columns()
         if self.mass.is_diagonal:
             return lambda r: inverse * r
@@ -93,15 +94,15 @@ def nodal_pencil(pencil: Pencil) -> NodalPencil:
     stiffness, mass = (
         Stencil(coefficients_of(each, space), space.periodic) for each in (pencil.stiffness, pencil.mass)
     )
-    # Under `jit` the masks are constants, and without the barrier the compiler would evaluate expressions of them.
+    # Under `jit`, masks are constants; the optimization barrier keeps XLA from computing with masks at compile time.
     masks = (jnp.asarray(mask_for(pencil, mask)) for mask in (space.free, space.domain))
     return lump(stiffness, mass, *jax.lax.optimization_barrier(tuple(masks)))
 
 
 def to_columns(rows: Float[Array, "b nodes"], shape: tuple[int, ...]) -> Float[Array, "*shape b"]:
     """Return rows of flat nodal arrays as a block of columns."""
-    # The barriers, here and below, keep XLA from fusing the transposition with matrix products, which would then access
-    # memory in the wrong order.
+    # Optimization barriers keep XLA from fusing the transposition, here and in `to_rows`, with matrix products, which
+    # would then access memory in the wrong order.
     return jax.lax.optimization_barrier(jnp.moveaxis(rows.reshape(-1, *shape), 0, -1))
 
 
@@ -111,17 +112,17 @@ def to_rows(columns: Float[Array, "*shape b"]) -> Float[Array, "b nodes"]:
 
 
 _FILLED = {2: 0.45, 3: 0.6}
-"""The least fraction of free nodes for which `on_all_nodes` uses all nodes, by dimension. If half of the nodes are free
-in 2D, later calls are 1.4 to 1.9 times slower, and about ten calls lose the time that the first call saves. In 3D the
-cost of a factorisation grows faster."""
+"""The least fraction of free nodes, for each dimension, at which `on_all_nodes` uses all nodes. With half of the nodes
+free in 2D, computations on all nodes take 1.4 to 1.9 times as long as on the free nodes, so that ten calls lose the
+time that the shared compilation saves. In 3D the cost of a factorisation grows faster with the number of nodes."""
 
 
 def on_all_nodes(pencil: AnyPencil, k: int = 0) -> AnyPencil:
     """Return a pencil on all nodes of a grid with the same lowest eigenpairs, if that is faster.
 
     Each node i that is not free gets a separate equation, Kᵢᵢ = σMᵢᵢ, with an eigenvalue σ above the lowest quarter of
-    the spectrum; the other eigenvectors vanish at this node. The pencil is returned unchanged if the number k of pairs
-    exceeds a quarter of its size, or if values are traced, since code is then compiled for each mask anyway.
+    the spectrum; the other eigenvectors vanish at node i. The pencil is returned unchanged if k, the number of wanted
+    eigenpairs, exceeds a quarter of its size, or if it is traced, as `jax.jit` compiles code for each mask anyway.
     """
     parts = tuple(_of_one(part) if 4 * k <= part.size else part for part in pencil.parts)
     return parts[0] if isinstance(pencil, Pencil) else MirrorPencil(parts, pencil.including)
@@ -145,21 +146,22 @@ def _of_one(pencil: Pencil) -> Pencil:
         vectors = space.extend(nulls.vectors, outside=0.0)
         nulls = NullSpace(vectors.reshape(len(vectors), whole.n_dof), nulls.fixed)
     sums = pencil.row_sums
-    if sums is not None:  # with an infinite row sum, `read` ignores the neighbours
+    if sums is not None:  # where the row sum is infinite, `read` does not add neighbouring values
         sums = jnp.where(space.free, space.extend(sums, outside=0.0), jnp.inf).ravel()
     stiffness = StencilOperator(of_stiffness, whole)
     return replace(pencil, stiffness=stiffness, mass=mass, space=whole, null_space=nulls, row_sums=sums)
 
 
-# The largest Kᵢᵢ/Mᵢᵢ is a Rayleigh quotient and so at most the largest eigenvalue: the spectrum does not become wider.
-# The quotient exceeds the lowest quarter of the spectrum. On a uniform grid with consistent mass, it is 6/h² in 2D and
-# 9/h² in 3D, and the quarter ends at 3.8/h² and 7.6/h². For lumped mass it is 2.7/h², and the quarter ends at 2.2/h²
-# and 2.4/h². Because this margin is small, the quotient is doubled; the spectrum then ends at 5.3/h², not 4/h².
+# The eigenvalue of the separate equations is the largest quotient Kᵢᵢ/Mᵢᵢ of the free nodes, a Rayleigh quotient, and
+# so at most the largest eigenvalue of the pencil. The quotient Kᵢᵢ/Mᵢᵢ must exceed the lowest quarter of the spectrum.
+# With a consistent mass and node spacing h, Kᵢᵢ/Mᵢᵢ is 6/h² in 2D and 9/h² in 3D, and the lowest quarter of the
+# spectrum ends at 3.8/h² and 7.6/h². With a lumped mass, Kᵢᵢ/Mᵢᵢ is 2.7/h², and the lowest quarter of the spectrum ends
+# at 2.2/h² in 2D and 2.4/h² in 3D. Because 2.7/h² is so close to the lowest quarter, the quotient of a lumped mass is
+# doubled; the spectrum in 2D then ends at 5.3/h², not at 4/h².
 @jax.jit
 def _with_others(
     stiffness: Float[Array, "offsets *shape"], mass: Float[Array, "m *shape"], free: Bool[np.ndarray | Array, "*shape"]
 ) -> tuple[Float[Array, "offsets *shape"], Float[Array, "m *shape"]]:
-    """Return the coefficients with a separate equation for each node that is not free."""
     of_stiffness, of_mass = len(stiffness) // 2, len(mass) // 2
     diagonals = jax.lax.stop_gradient((stiffness[of_stiffness], mass[of_mass]))
     own, unit = (jnp.where(free, diagonal, 0) for diagonal in diagonals)

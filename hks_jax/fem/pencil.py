@@ -34,8 +34,8 @@ class Pencil(SymmetricPencil):
         null_space: the null space of a positive semidefinite K; None if it is not known, and then K may be indefinite.
         lower_bound: a lower bound of the spectrum, if one is known for a K that may be indefinite; derivatives treat it
             as constant.
-        row_sums: (n_dof,) the row sums of M, including eliminated columns, from which `read` computes nodal values;
-            infinite at nodes where functions vanish. None if the unknowns are the nodal values.
+        row_sums: (n_dof,) the row sums of M over all nodes, from which `read` computes nodal values; infinite at nodes
+            where functions vanish, and None if the unknowns are nodal values already.
     """
 
     metric: SampledMetric | None
@@ -71,7 +71,7 @@ class Pencil(SymmetricPencil):
         return functions if self.row_sums is None else _read(self.mass, self.row_sums, functions)
 
     def integrals(self, values: Float[Array, "... n_dof"]) -> Float[Array, "... n_dof"]:
-        """Return weights w with w·φ = ∫φu, where φ are nodal values from `read`, and u has the nodal ``values``."""
+        """Return weights w for nodal ``values`` of a function u: w·φ = ∫φu for all nodal values φ from `read`."""
         if self.row_sums is None:
             return self.mass.apply(values)
         return jnp.where(jnp.isinf(self.row_sums), 0, self.row_sums) * values
@@ -92,14 +92,14 @@ class Pencil(SymmetricPencil):
         return replace(self, stiffness=stiffness, null_space=None, lower_bound=None)
 
     def counted_from(self, origin: Float[Array, ""]) -> "Pencil":
-        """Return the pencil of K − σM and M without null vectors, where σ is a lower bound of the spectrum."""
+        """Return the pencil of K − σM and M with an empty null space, where σ = ``origin`` is below the spectrum."""
         moved = self.stiffness.with_flat(self.shifted(origin))
         nothing = NullSpace(jnp.zeros((0, self.size), origin.dtype))
         return replace(self, stiffness=moved, null_space=nothing, lower_bound=None, row_sums=None)
 
     @property
     def parts(self) -> tuple["Pencil", ...]:
-        """The pencil itself, as the only problem."""
+        """The pencil itself, as the only part."""
         return (self,)
 
 
@@ -110,16 +110,17 @@ def _read(mass: Operator, row_sums: Float[Array, " n_dof"], functions: Float[Arr
 
 
 class MirrorPencil(eqx.Module):
-    """The 2^m mixed Neumann/Dirichlet pencils of a domain doubled m times: reflected along axes, or along its rim.
+    """The 2^m mixed Neumann/Dirichlet pencils of a domain doubled m times, by reflections or by gluing along the rim.
 
-    The union of their spectra is the spectrum of the doubled domain. An eigenfunction of a part, divided by √2^m, is
-    the restriction of an eigenfunction of the doubled domain to the original domain.
+    The union of the spectra of the 2^m pencils is the spectrum of the doubled domain. An eigenfunction of one of the
+    pencils, divided by √2^m, is the restriction of an eigenfunction of the doubled domain to the original domain.
 
     Attributes:
-        parts: the mixed problems; the first has Neumann conditions wherever the domain is doubled.
-        including: for each part, the earlier parts whose function space includes its own, and the part itself. By the
-            min–max principle, eigenvalue i of a part is not less than eigenvalue i of a part that includes it. So a
-            part that c parts include has at most the fraction 1/c of the lowest eigenvalues of the doubled domain.
+        parts: the 2^m pencils; the first one has Neumann conditions on all mirrors and glued rims.
+        including: for each part, itself and the earlier parts whose function spaces contain its function space. By the
+            min–max principle, eigenvalue i of a part is not less than eigenvalue i of a part with a larger function
+            space. A part whose functions belong to c parts has at most the fraction 1/c of the lowest eigenvalues of
+            the doubled domain.
     """
 
     parts: tuple[Pencil, ...]
@@ -142,8 +143,8 @@ class MirrorPencil(eqx.Module):
 
     def read(self, functions: Float[Array, "k n_dof"], part: Int[Array, " k"] | None) -> Float[Array, "k n_dof"]:
         """Return the values of functions at the free nodes, given their unknowns and each function's part."""
-        # At the free nodes of a part, its mass equals the first part's mass; at other nodes the part's functions
-        # vanish.
+        # At the free nodes of a part, the mass of the part equals the mass of the first part; at all other nodes, the
+        # functions of the part vanish.
         sums = [
             jnp.where(part.space.free, part.space.extend(part.row_sums, outside=0.0), jnp.inf)
             for part in self.parts
@@ -196,10 +197,11 @@ def assembled(
     return Pencil(stiffness, mass, metric, volume, space, null_space=nulls, lower_bound=bound, row_sums=sums)
 
 
-# With a potential V and a density ρ, K = A + ∫ρV hᵢhⱼ, where A ⪰ 0. If V ≥ v at the quadrature points, K − vM ⪰ 0 for
-# the mass M from the same points. The lumped mass D ⪰ M is larger, so that K − vD ⪰ 0 is certain only for v ≤ 0.
+# With a potential V and a density ρ, the stiffness is K = A + ∫ρV hᵢhⱼ, where A ⪰ 0. If the potential is at least v at
+# the quadrature points, K − vM ⪰ 0 for the mass M from the same quadrature points. The lumped mass D ⪰ M exceeds the
+# consistent mass M, so that K − vD ⪰ 0 is certain only if the least potential v is not positive.
 def _least(potential: Field, space: FunctionSpace, operator: WeakForm) -> Float[Array, ""] | None:
-    """Return a lower bound of the spectrum; None if interpolated values may be less than the nodal values."""
+    """Return a lower bound of the spectrum, or None if the interpolated potential may fall below its nodal values."""
     if potential.at == "nodes" and isinstance(space, MeshSpace) and space.degree == 2:
         return None
     least = jnp.min(jax.lax.stop_gradient(potential.values))
@@ -224,14 +226,13 @@ def gathered(space: MeshSpace | VectorSpace, matrices: Float[Array, "E m m"]) ->
 
 
 def row_sums_of(space: MeshSpace | VectorSpace, matrices: Float[Array, "E m m"]) -> Float[Array, "*node_shape"]:
-    """Return the row sums at all nodes, including columns of eliminated nodes."""
+    """Return the row sums of the assembled matrix at all nodes, including the columns of eliminated nodes."""
     sums = jnp.sum(matrices, axis=-1).ravel()
     return jax.ops.segment_sum(sums, space.cells.ravel(), space.free.size).reshape(space.node_shape)
 
 
 @lru_cache(maxsize=16)
 def _sparse_pattern(space: MeshSpace | VectorSpace) -> tuple[np.ndarray, np.ndarray, SparsePattern]:
-    """Return the local entries between free nodes, the matrix entry to which each is added, and the pattern."""
     n, corners = space.n_dof, space.cells.shape[1]
     cells = space.degrees_of_freedom[space.cells]
     rows, cols = np.repeat(cells, corners, axis=1).ravel(), np.tile(cells, (1, corners)).ravel()

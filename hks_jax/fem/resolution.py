@@ -18,7 +18,7 @@ from hks_jax.fem.space import FunctionSpace, GridSpace, MeshSpace, mask_for
 class SampledMetric(eqx.Module):
     """The metric from which a pencil was assembled, for error estimates; derivatives treat it as constant."""
 
-    tensors: Float[Array, "*shape d d"]  # at the nodes of a grid, or in the basis of the edges of each cell of a mesh
+    tensors: Float[Array, "*shape d d"]  # the metric at grid nodes, or on mesh cells in the basis of the cell's edges
     spacing: Float[np.ndarray | Array, " d"] | None  # the spacing of the grid; None on a mesh
     interpolation: Interpolation = eqx.field(static=True, default="linear")
 
@@ -27,16 +27,15 @@ class Resolution(eqx.Module):
     """The effect of the spacing on signatures to leading order (see `truncation`); derivatives treat it as constant."""
 
     mesh_width: Float[Array, "*shape"]  # the distance between neighbouring nodes in the units of the metric
-    dispersion: Float[Array, "*shape"]  # a, in (metric length)², if constant tensors have the relative bias (a/t)^order
-    turning: Float[Array, "*shape"]  # the relative error of eigenvalues from tensors that rotate or stretch
+    dispersion: Float[Array, "*shape"]  # the coefficient a (a length²) of the bias (a/t)^order for constant tensors
+    turning: Float[Array, "*shape"]  # the relative error of eigenvalues that varying tensors cause
     swelling: Float[Array, ""]  # the relative error of the domain's area or volume
-    order: int = eqx.field(static=True, default=1, kw_only=True)  # 2 if the leading error cancels, else 1
+    order: int = eqx.field(static=True, default=1, kw_only=True)  # the exponent of a/t: 2 if the leading error cancels
 
 
 def resolution_of(metric: SampledMetric, space: FunctionSpace, lumped: bool, cancelling: bool) -> Resolution:
     """Return the resolution of the functions of a space, from the spacing of a grid or the edges of a mesh."""
     if isinstance(space, GridSpace):
-        # The mask is passed as an array, so that grids that differ only in the mask share one compilation.
         domain = mask_for(metric.tensors, space.domain)
         settings = space.periodic, metric.interpolation, lumped, cancelling
         return Resolution(*_of_grid(metric.tensors, domain, metric.spacing, *settings), order=1 + cancelling)
@@ -44,23 +43,25 @@ def resolution_of(metric: SampledMetric, space: FunctionSpace, lumped: bool, can
     return _of_mesh(metric.tensors, space.triangulation.cells, space.triangulation.n_vertices, lumped)
 
 
-# If tensors are nearly constant, a plane wave with wave vector k has the discrete eigenvalue λ(1 + δ), where λδ =
-# Σₐ hₐ² g^aa kₐ⁴/12. With the consistent mass, squared nodal values are too large by the factor 1 + Σₐ hₐ²kₐ²/6. In the
-# signature, k is normal with covariance g/2t: E kₐ² = gₐₐ/2t and E kₐ⁴ = 3gₐₐ²/4t². Its relative error is
+# In a nearly constant metric g, a plane wave with the wave vector k has the discrete eigenvalue λ(1 + δ) in place of λ,
+# where λδ = Σₐ hₐ² g^aa kₐ⁴/12 for the spacing hₐ along axis a. With the consistent mass, the squared nodal values of
+# the wave are too large by the factor 1 + Σₐ hₐ²kₐ²/6. In the signature, the wave vector k is normally distributed with
+# covariance g/2t: E kₐ² = gₐₐ/2t and E kₐ⁴ = 3gₐₐ²/4t². The relative error of the signature is
 #
 #     −t E λδ + E Σₐ hₐ²kₐ²/6 = Σₐ hₐ² (gₐₐ/12 − g^aa gₐₐ²/16)/t.
 #
-# A lumped mass divides λ and the squared nodal values by 1 + Σₐ hₐ²kₐ²/6. By E λkₐ² = (d + 2)gₐₐ/4t² this division adds
-# d/24 Σₐ hₐ²gₐₐ/t to the error. The code has 1/20 in place of 1/24, which includes the next terms at t = 6h².
+# A lumped mass divides the eigenvalue λ and the squared nodal values of a plane wave by 1 + Σₐ hₐ²kₐ²/6. Since
+# E λkₐ² = (d + 2)gₐₐ/4t² in d dimensions, a lumped mass adds d/24 Σₐ hₐ²gₐₐ/t to the relative error of the signature.
+# The code has 1/20 in place of 1/24, to include terms of higher order in h²/t at t = 6h².
 #
-# If the leading error cancels (hks_jax/fem/elements.py) and the tensor is diagonal, λδ = −Σₐ hₐ⁴ g^aa kₐ⁶/240, and the
-# squared nodal values have the factor 1 + (Σₐ hₐ²kₐ²)²/576. With E kₐ⁶ = 15gₐₐ³/8t³ the relative error is
+# If the leading error cancels (hks_jax/fem/elements.py) and the metric is diagonal, the error of the eigenvalue is
+# λδ = −Σₐ hₐ⁴ g^aa kₐ⁶/240, and the squared nodal values have the factor 1 + (Σₐ hₐ²kₐ²)²/576. Since E kₐ⁶ = 15gₐₐ³/8t³
+# for the wave vector k, the relative error of the signature is
 #
 #     Σₐ hₐ⁴gₐₐ²/128t² + Σₐᵦ hₐ²hᵦ² (gₐₐgᵦᵦ + 2gₐᵦ²)/2304t².
 #
-# For tensors that are not diagonal, the error is half to twice as large.
+# For a metric that is not diagonal, the error is half to twice as large as the formula for a diagonal metric.
 def _dispersion(xp: Any, tensors: Any, spacing: Any, lumped: bool, cancelling: bool) -> Any:
-    """Return `Resolution.dispersion` for Q1 elements."""
     inverse, d = spd.inverse(tensors), tensors.shape[-1]
     if cancelling:
         scaled = tensors * spacing[:, None] * spacing
@@ -75,11 +76,11 @@ def _dispersion(xp: Any, tensors: Any, spacing: Any, lumped: bool, cancelling: b
     return total
 
 
-# Between neighbours along axis a, the flux matrix A = √|T| T⁻¹ changes by δA, and an element uses the mean of A. Let eₐ
-# be the unit vector along axis a. The exact solution u = p·x + w has a corrector w with ∂ₐ(Aₐₐ∂ₐw) = −(∂ₐA eₐ)·p. The
-# energy of an element does not include the energy of the corrector, Aₐₐ(∂ₐ²w)² hₐ²/12. If p has the covariance A⁻¹, the
-# missing energy is δAeₐ·A⁻¹δAeₐ/12Aₐₐ, relative to the energy of p along one axis. The estimate holds for √t above the
-# length on which A varies; for smaller t only its order of magnitude is right.
+# Between neighbours along axis a, the flux matrix A = √|T| T⁻¹ changes by δA, and an element uses the mean of A. The
+# exact solution p·x + w with the gradient p has a corrector w with ∂ₐ(Aₐₐ∂ₐw) = −(∂ₐA eₐ)·p, where eₐ is the unit
+# vector of axis a. An element lacks the energy of the corrector w, Aₐₐ(∂ₐ²w)² hₐ²/12. For gradients p with the
+# covariance A⁻¹, the missing energy is δAeₐ·A⁻¹δAeₐ/12Aₐₐ, relative to the energy of p along one axis. The estimate
+# holds for √t above the length on which the metric varies; for smaller t only its order of magnitude is right.
 def _turning(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...]) -> Any:
     """Return the relative error (*shape) of eigenvalues due to the variation of tensors between neighbours."""
     root = xp.sqrt(spd.determinant(tensors))[..., None, None]
@@ -96,17 +97,17 @@ def _turning(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...]) -> 
     return total
 
 
-# At distance ξ from a node along axis a, the interpolation error is −ξ(h − ξ)/2 times the second derivative. The mean
-# of this factor is −h²/12. The relative error of the density √|T| is half the trace of T⁻¹ times the error of T. So
-# this error is proportional to tr T⁻¹∂ₐ²T if T is interpolated, and to ∂ₐ²log|T| if log T is interpolated.
+# At distance ξ from one of two nodes with the spacing h, linear interpolation has the error ξ(h − ξ)/2 times the second
+# derivative of the interpolated quantity. The mean of ξ(h − ξ)/2 between the nodes is h²/12. The relative error of the
+# density √|T| is half the trace of T⁻¹ times the error of T. The relative error of the volume is therefore proportional
+# to tr T⁻¹∂ₐ²T if T is interpolated, and to ∂ₐ²log|T| if log T is interpolated.
 def _swelling(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...], interpolation: Interpolation) -> Any:
-    """Return the relative error of the domain's volume due to the interpolation between the nodes."""
     determinant, inverse = spd.determinant(tensors), spd.inverse(tensors)
     density, total = xp.sqrt(determinant), xp.zeros((), tensors.dtype)
     for a, wraps in enumerate(periodic):
         if interpolation == "linear":
             second = xp.roll(tensors, 1, a) + xp.roll(tensors, -1, a) - 2 * tensors
-            error = (inverse * second).sum((-2, -1))  # both are symmetric
+            error = (inverse * second).sum((-2, -1))  # both matrices are symmetric
         else:
             logarithm = xp.log(determinant)
             error = xp.roll(logarithm, 1, a) + xp.roll(logarithm, -1, a) - 2 * logarithm
@@ -117,7 +118,7 @@ def _swelling(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...], in
 
 
 def _neighbours(xp: Any, domain: Any, axis: int, wraps: bool) -> Any:
-    """Mark the nodes (*shape) that are in the domain together with the next node along the axis."""
+    """Return a mask (*shape) of the nodes that are in the domain and have a next node in the domain along the axis."""
     pairs = xp.logical_and(domain, xp.roll(domain, -1, axis))
     if wraps:
         return pairs
@@ -149,8 +150,8 @@ def _of_grid(
 _BIAS = (0.03, 0.22)
 """The constant c in the relative bias c·h²/t of P1 elements, for consistent and lumped mass; h is the longest edge.
 
-On regular and perturbed meshes of squares, spheres, boxes and balls, the median of c over the nodes was 0.008 … 0.028
-for consistent and 0.03 … 0.14 for lumped mass."""
+On regular and perturbed meshes of squares, spheres, boxes and balls, the median of the constant c over the nodes was
+0.008 … 0.028 with a consistent mass and 0.03 … 0.14 with a lumped mass."""
 
 
 @jit_quickly(static_argnames=("n_vertices", "lumped"))

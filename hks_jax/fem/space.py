@@ -54,7 +54,7 @@ class FunctionSpace(ByKey):
 
     @cached_property
     def degrees_of_freedom(self) -> Int[np.ndarray, " nodes"]:
-        """The number of each node's degree of freedom, or −1; nodes are in flat order."""
+        """The index of each node's degree of freedom, or −1 at nodes without one; nodes are in flat order."""
         numbers = np.full(self.free.size, -1)
         numbers[self._free_indices] = np.arange(self.n_dof)
         return numbers
@@ -65,9 +65,9 @@ class FunctionSpace(ByKey):
 
     @cached_property
     def null_labels(self) -> Int[np.ndarray, " n_dof"]:
-        """The number 0 … n_null − 1 of the null vector that is 1 at each degree of freedom, or −1 if all are 0 there.
+        """The index of the null vector that is 1 at each degree of freedom, or −1 where all null vectors are 0.
 
-        The stiffness annihilates the constant on each connected component that has no Dirichlet node.
+        The null vectors are 1 on one connected component of the domain without Dirichlet nodes, and 0 elsewhere.
         """
         pinned = np.unique(self._labels[self.domain & ~self.free])
         labels = self._labels.ravel()[self._free_indices]
@@ -76,7 +76,7 @@ class FunctionSpace(ByKey):
 
     @property
     def n_null(self) -> int:
-        """The number of zero eigenvalues, one for each component without Dirichlet nodes."""
+        """The number of zero eigenvalues, one for each connected component of the domain without Dirichlet nodes."""
         return int(self.null_labels.max(initial=-1)) + 1
 
     def restrict(self, nodal: Float[Array, "*leading_and_node_shape"]) -> Float[Array, "... n_dof"]:
@@ -114,7 +114,6 @@ def taken(xp: Any, values: Any, indices: Any) -> Any:
 
 @numpy_where_known(most=_COPIED)
 def _spread(xp: Any, values: Any, indices: Any, fill: Any) -> Any:
-    """Return an array (…, n) with values at given indices of the last axis, and with ``fill`` (n,) elsewhere."""
     full = xp.tile(fill, (*values.shape[:-1], 1))
     if xp is jnp:
         return full.at[..., indices].set(values, unique_indices=True, indices_are_sorted=True)
@@ -198,7 +197,7 @@ class MeshSpace(FunctionSpace):
 
 @jax.tree_util.register_static
 class VectorSpace(FunctionSpace):
-    """Functions with several components on the nodes of another space; results have a last axis of components."""
+    """Functions with several components on the nodes of a scalar space; results have a last axis of components."""
 
     def __init__(self, base: "GridSpace | MeshSpace", components: int) -> None:
         self.base, self.components = base, components
@@ -213,7 +212,7 @@ class VectorSpace(FunctionSpace):
 
 @jax.tree_util.register_static
 class MatrixSpace(FunctionSpace):
-    """The nodes of matrices from elsewhere, for which only the shape of nodal arrays is known."""
+    """The nodes of the user's matrices, for which only the shape of nodal arrays is known."""
 
     dimension: int | None  # type: ignore[assignment]  # None if it is not known
 
@@ -238,7 +237,7 @@ def axis_colours(n: int, spacing: int, wraps: bool) -> Int[np.ndarray, " n"]:
     """Return the colours of the nodes along one axis; nodes of the same colour are at least ``spacing`` nodes apart."""
     if not wraps:
         return np.arange(n) % min(spacing, n)
-    # The axis is split into as many runs of at least `spacing` nodes as fit. A node's colour is its place in the run.
+    # The axis is split into as many runs of at least `spacing` nodes as fit; a colour is the index within a run.
     runs = max(n // spacing, 1)
     return np.concatenate([np.arange(len(run)) for run in np.array_split(np.arange(n), runs)])
 
@@ -250,9 +249,9 @@ def mask_for(values: Any, mask: Bool[np.ndarray, "*shape"]) -> Bool[np.ndarray |
 
 
 def couplings_for(values: Any, space: GridSpace) -> Bool[np.ndarray | Array, "offsets *shape"] | None:
-    """Return, for each offset and node, whether both coupled nodes are free, as a mask for an array ``values``.
+    """Return the mask (offsets, *shape) of the couplings of a stencil between two free nodes.
 
-    The result is None if the values are traced and all nodes of the domain are free.
+    For ``values`` traced under `jit`, the mask is a JAX array if possible, or None if all nodes of the domain are free.
     """
     staged = is_traced(values) and is_staged()
     if staged and (space.free == space.domain).all():
@@ -285,7 +284,7 @@ def _outer(axes: Sequence[Bool[np.ndarray, "_m _n"]]) -> Bool[Array, "ms *ns"]:
     whole = tuple(map(int, shapes.ravel()))
     result = jnp.ones((), bool)
     if not all(axis.all() for axis in axes):
-        # The barrier keeps the compiler from computing the outer product during compilation.
+        # The optimization barrier keeps the compiler from computing the outer product during compilation.
         known = jax.lax.optimization_barrier([jnp.asarray(axis) for axis in axes])
         places = [tuple(n if i % d == axis else 1 for i, n in enumerate(whole)) for axis in range(d)]
         result = reduce(jnp.logical_and, [axis.reshape(place) for axis, place in zip(known, places, strict=True)])

@@ -28,7 +28,7 @@ from hks_jax.linear.pencil import NullSpace, SymmetricPencil
 from hks_jax.traced import is_traced
 
 _FEW = 8
-"""Up to this number, all null vectors are checked."""
+"""The number of null vectors up to which `require_null_space` checks each vector."""
 
 
 class _Entries(NamedTuple):
@@ -58,12 +58,12 @@ def sparse_pencil(
         K: a symmetric matrix (n, n): a SciPy sparse matrix, a BCOO or BCSR of `jax.experimental.sparse` (whose data
             may be traced, but not its indices), an operator of this package, or a full array; or a pencil, which
             includes M.
-        M: a symmetric positive definite matrix of the same kinds, or its diagonal (n,); None is the identity. Its
-            pattern may differ from that of K.
-        null_vectors: (m, n) a basis of the whole null space of K ⪰ 0, where m may be 0. None if it is not known; then K
-            may be indefinite, and eigenvalues that are zero within rounding are set to zero.
-        dimension: the dimension of the manifold, 2 or 3, for Weyl's law and for ``normalisation="flat"``.
-        volume: the volume in the units of the metric, for ``normalisation="volume"``.
+        M: a symmetric positive definite matrix of the same kinds, or its diagonal (n,); None is the identity. The
+            sparsity patterns of M and K may differ.
+        null_vectors: (m, n) a basis of the whole null space of K ⪰ 0, where m may be 0. If no basis is given, K may be
+            indefinite, and eigenvalues that are zero within rounding are set to zero.
+        dimension: the dimension of the manifold, 2 or 3; Weyl's law and ``normalisation="flat"`` need this number.
+        volume: the volume of the manifold in the units of the metric, for Weyl's law and ``normalisation="volume"``.
         shape: the shape of nodal arrays, with n nodes; None is (n,).
 
     Raises:
@@ -139,7 +139,6 @@ def require_null_space(pencil: SymmetricPencil) -> None:
     """Raise ValueError unless the stiffness annihilates the pencil's null space; traced values are not checked."""
     if pencil.null_space is None or is_traced(pencil) or not pencil.n_null:
         return
-    # The check uses NumPy, which needs no compilation.
     where, rows, cols = pencil.pattern.places()
     data, finfo = np.asarray(pencil.stiffness.flat())[where], np.finfo(pencil.stiffness.dtype)
     size = max(np.bincount(rows, np.abs(data), pencil.size).max(), finfo.tiny)
@@ -150,7 +149,7 @@ def require_null_space(pencil: SymmetricPencil) -> None:
 
     vectors = np.asarray(pencil.null_space.vectors)
     lengths = np.abs(vectors).max(axis=1, keepdims=True)
-    # If there are many vectors, only a random linear combination of all vectors is checked.
+    # Of more than `_FEW` null vectors, only a random linear combination is checked.
     weights = np.random.default_rng(0).standard_normal(len(vectors))
     some = vectors if len(vectors) <= _FEW else [weights @ (vectors / np.where(lengths > 0, lengths, 1))]
     if max(map(defect, some)) > ROUNDING * finfo.eps:

@@ -22,7 +22,7 @@ from hks_jax.linear.pattern import Pattern
 from hks_jax.linear.products import of_each_row
 
 _CELL = {2: 25, 3: 64}
-"""The largest number of nodes of a part that is not bisected. Smaller parts need fewer operations, but more batches."""
+"""The number of nodes up to which bisection leaves a part whole; smaller numbers save operations, but add batches."""
 
 
 @jax.tree_util.register_static
@@ -42,7 +42,7 @@ class GridPattern(ByKey, Pattern):
         return 3**self.space.dimension // 2 * self.space.free.size + np.flatnonzero(self.space.free)
 
     def bisect(self) -> Parts:
-        """Cut parts recursively at the median of their longest side, by one or two lines of nodes (in 3D, a plane)."""
+        """Bisect the grid recursively at the median of each part's longest side, by lines of nodes (in 3D, planes)."""
         x = np.stack(np.nonzero(self.space.free)).astype(np.int32)
         d, n = x.shape
         level, part, left, q = np.zeros(n, np.int8), np.zeros(n, int), np.arange(n), np.zeros(n, int)
@@ -53,7 +53,6 @@ class GridPattern(ByKey, Pattern):
             if counts.max() <= _CELL[d]:
                 level[left], part[left] = depth, q
                 return Parts(level, part, depth + 1)
-            # Cut every part across its longest side, at the median.
             low, high = np.full((d, parts), np.iinfo(np.int32).max, np.int32), np.full((d, parts), -1, np.int32)
             for axis in range(d):
                 np.minimum.at(low[axis], q, x[axis])
@@ -83,7 +82,7 @@ class GridPattern(ByKey, Pattern):
 
 @lru_cache(maxsize=16)
 def _couplings(space: GridSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    # Degrees of freedom are counted from 1, and 0 marks nodes without one.
+    # A node's entry is 1 plus the index of its degree of freedom, or 0 if the node is not free.
     own = (space.degrees_of_freedom + 1).reshape(space.node_shape).astype(np.int32)
     where, rows, cols = [], [], []
     for o, other in enumerate(neighbours(with_rim(own, space.periodic), own.ndim)):
@@ -97,16 +96,16 @@ def _couplings(space: GridSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 class Stencil(eqx.Module):
     """A matrix that couples each node of a grid to its 3^d neighbours, applied to blocks of nodal columns (*shape, b).
 
-    In this layout a product reads each coefficient once for all columns. In 3D this is about twice as fast as products
-    with single rows. Stencils of the same shape share compiled code, even if their masks differ.
+    A product reads each coefficient once for all columns of a block. In 3D, products with blocks are about twice as
+    fast as products with single rows. Stencils of the same shape share compiled code, even if their masks differ.
 
     The offsets o of the coefficients are in the order of ``product((-1, 0, 1), repeat=d)``: entry (o, i) couples node i
     to node i + o. A diagonal matrix has coefficients (1, *shape). Couplings across non-periodic sides are 0.
     """
 
     coefficients: Float[Array, "offsets *shape"]
-    periodic: tuple[bool, ...] = eqx.field(static=True)  # for each axis, whether node n is node 0
-    slabs: Slabs | None = eqx.field(default=None, static=True)  # how the grid is divided, if this is one slab of it
+    periodic: tuple[bool, ...] = eqx.field(static=True)  # whether each axis is periodic
+    slabs: Slabs | None = eqx.field(default=None, static=True)  # the grid's division, if the stencil is for a slab
 
     @property
     def is_diagonal(self) -> bool:
@@ -122,10 +121,7 @@ class Stencil(eqx.Module):
         return self.of_columns()(x)
 
     def of_columns(self) -> Callable[[Float[Array, "*shape b"]], Float[Array, "*shape b"]]:
-        """Return the function that multiplies columns by the matrix.
-
-        Call this method before a loop of products, because it rearranges the coefficients.
-        """
+        """Return the function that multiplies columns; call `of_columns` outside loops: it rearranges coefficients."""
         apply = self.of_rimmed()
         return (lambda x: apply(x, x)) if self.is_diagonal else (lambda x: apply(x, self.rimmed(x)))
 
@@ -139,14 +135,14 @@ class Stencil(eqx.Module):
         return jnp.pad(x.reshape(-1, x.shape[-1]), ((reach, reach), (0, 0)))
 
     def of_rimmed(self) -> Callable[[Float[Array, "*shape b"], Float[Array, "..."]], Float[Array, "*shape b"]]:
-        """Return the product as a function of columns x and ``rimmed(x)``, which several stencils can share."""
+        """Return the product as a function of x and ``rimmed(x)``, so that several stencils can share ``rimmed(x)``."""
         if self.is_diagonal:
             return lambda x, _: self.coefficients[0][..., None] * x
         if self.slabs is not None or any(self.periodic):
             of_box = product_with_rim(self.coefficients)
             return lambda _, rimmed: of_box(rimmed)
-        # If the nodes are numbered in one row, each neighbour is at a fixed distance in this row. Where the row
-        # continues beyond a side, the coefficients are zero, since no element couples the two nodes.
+        # In the flat order of the nodes, each neighbour is at a fixed distance. If this distance leads across a side of
+        # the grid, the coefficient of the neighbour is zero, since no element couples the two nodes.
         distances, reach = _distances(self.coefficients.shape[1:])
         row = side_by_side(self.coefficients).reshape(-1, len(distances))
         nodes = len(row)
@@ -164,13 +160,13 @@ class Stencil(eqx.Module):
         return of_row
 
     def outer(self, p: Float[Array, "*shape b"], x: Float[Array, "*shape b"]) -> Float[Array, "offsets *shape"]:
-        """Return Σ_b p[i, b] x[i + o, b] for every offset o: the derivative of Σ_b pᵀCx with respect to C."""
+        """Return Σ_b p[i, b] x[i + o, b]: the derivative of Σ_b pᵀCx by the coefficient C of node i and offset o."""
         shifts = [x] if self.is_diagonal else neighbours(with_rim(x, self.periodic), len(self.periodic))
         return jnp.stack([jnp.sum(p * shifted, axis=-1) for shifted in shifts])
 
 
 def _distances(shape: tuple[int, ...]) -> tuple[list[int], int]:
-    """Number the nodes in one row; return the distance of each neighbour in this row, and the largest distance."""
+    """Return the distances of the neighbours of a node in the flat order of the nodes, and the largest distance."""
     strides = [math.prod(shape[axis + 1 :]) for axis in range(len(shape))]
     distances = [sum(map(mul, offset, strides)) for offset in product((-1, 0, 1), repeat=len(shape))]
     return distances, distances[-1]
@@ -208,7 +204,7 @@ class StencilOperator(PatternedOperator):
         shape, coefficients = self.space.node_shape, list(self.coefficients)
 
         def product_with(row: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-            # With the barrier, the neighbours are slices of one padded array. Without it, XLA would pad for each node.
+            # With an optimization barrier, neighbours are slices of one padded array; else XLA would pad for each node.
             rimmed = jax.lax.optimization_barrier(with_rim(row, self.space.periodic))
             terms = zip(coefficients, neighbours(rimmed, len(shape)), strict=True)
             return reduce(add, (c * shifted for c, shifted in terms))
@@ -217,13 +213,13 @@ class StencilOperator(PatternedOperator):
         return self.space.restrict(of_each_row(product_with, rows).reshape(*x.shape[:-1], *shape))
 
     def of_columns(self) -> OfColumns:
-        """Return the function that multiplies a block of columns, which is twice as fast as to multiply rows."""
+        """Return the function that multiplies a block of columns, twice as fast as `apply` multiplies rows."""
         shape = self.space.node_shape
         product_with = Stencil(self.coefficients, self.space.periodic).of_columns()
         free, numbers = np.flatnonzero(self.space.free), self.space.degrees_of_freedom
         if free.size == numbers.size:
             return lambda x: product_with(x.reshape(*shape, -1)).reshape(x.shape)
-        numbers = np.where(numbers < 0, free.size, numbers)  # out of range at nodes that are not free
+        numbers = np.where(numbers < 0, free.size, numbers)  # an index out of range where a node is not free
 
         def product_of_free(x: Float[Array, "n_dof b"]) -> Float[Array, "n_dof b"]:
             nodal = x.at[numbers].get(mode="fill", fill_value=0)

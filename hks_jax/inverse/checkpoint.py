@@ -1,4 +1,4 @@
-"""Checkpoints of a fit. A file is written completely or not at all."""
+"""Checkpoints of a fit. A checkpoint file is written completely or not at all."""
 
 import dataclasses
 import hashlib
@@ -18,11 +18,11 @@ class Checkpoint:
 
     values: Any  # the unknowns
     history: list[Step]  # the steps so far
-    start: int  # the number of the current start
-    stage: int  # the number of the current stage of the continuation
-    step_size: float  # the divisor of the damping
-    best: Any  # the unknowns of the best earlier start
-    losses: list[float]  # the losses of earlier starts
+    start: int  # the index of the current initial guess; 0 is the initial field
+    stage: int  # the index of the current continuation stage; later stages fit smaller times
+    step_size: float  # the divisor of the Gauss–Newton damping
+    best: Any  # the unknowns of the best fit from an earlier initial guess
+    losses: list[float]  # the final loss for each earlier initial guess
 
 
 def fingerprint(*parts: Any) -> str:

@@ -34,18 +34,18 @@ class InnerProduct(eqx.Module):
 
 
 class Smoothing(InnerProduct):
-    """The inner product ⟨x, y⟩ + ℓ²⟨∇x, ∇y⟩ of each component, where ℓ is the length below which steps are smooth.
+    """The inner product ⟨x, y⟩ + ℓ²⟨∇x, ∇y⟩ of nodal parameters x and y, which makes steps smooth below the length ℓ.
 
-    The inner product has a mass matrix, because a boundary node has only half a cell and affects the data less.
+    The mass matrix gives boundary nodes less weight, because they have only half a cell and affect the data less.
     """
 
     pencil: Pencil  # the stiffness K and the lumped mass M of the flat metric
-    factor: Factorisation | None  # the factorisation of K + M/ℓ²; None for ℓ = 0
-    length: Float[Array, ""]  # ℓ, in coordinate units
-    cell: Float[Array, ""]  # the mean mass of a node, which all masses are divided by
+    factor: Factorisation | None  # the factorisation of the matrix K + M/ℓ²; None for ℓ = 0
+    length: Float[Array, ""]  # the length ℓ, in coordinate units
+    cell: Float[Array, ""]  # the mean of the nodal masses, by which all masses are divided
 
     def apply(self, values: Values) -> Values:
-        """Return (M + ℓ²K) x for the unknowns x, divided by the mass of a cell."""
+        """Return (M + ℓ²K) x for the unknowns x, divided by the mean nodal mass."""
         x = values.T
         return ((self.pencil.mass.apply(x) + self.length**2 * self.pencil.stiffness.apply(x)) / self.cell).T
 
@@ -70,32 +70,35 @@ def smoothing(grid: Grid, length: float, dtype: np.dtype) -> Smoothing:
 _TOP = 0.03
 """The size of the largest eigenvalues of JᵀJ, where J is the Jacobian of the data, for weights that add up to one."""
 _POWER, _REACH = 3, 9.0
-"""Of all preconditioners (1 + λt/a)ⁿ, n = 3 and a = 9 needed nearly the fewest steps on 32² and 64² nodes."""
+"""The exponent n and the divisor a of the preconditioner B½ (1 + tL/a)⁻ⁿ B½, where t is the smallest time. On 32² and
+64² nodes, the exponent 3 and the divisor 9 took nearly the fewest conjugate gradient steps."""
 
 
-# In the plane the metric (1 + εu) I has the Laplacian (1 − εu) Δ and the area element (1 + εu) dx. By Duhamel's formula
-# this metric has the signature h₀ (1 + εv) with h₀ = 1/(4πt). For u(z) = exp(iξ·z) and x = t|ξ|²,
+# To first order in ε, the metric (1 + εu) I of the plane has the Laplacian (1 − εu) Δ and the area element (1 + εu) dx.
+# By Duhamel's formula, the metric (1 + εu) I has the HKS (1 + εv)/(4πt), with a relative change εv. If the perturbation
+# u(z) = exp(iξ·z) is a wave with the wave vector ξ, the change v at the time t = x/|ξ|² is
 #
 #     v = a(x) u,    a(x) = ∫₀¹ (1 + x (1 − s)²) exp(−x s (1 − s)) ds − 1.
 #
-# For small x, a(x) is x/6, which is the contribution tK/3 of the curvature K; for large x, a(x) is of order 1/x. So JᵀJ
-# is about Σₜ wₜ a(tL)², where wₜ are the weights of the times and L is the Laplacian. Except for the first few, the
-# eigenvalues of JᵀJ decrease with frequency, on grids even faster, because interpolation damps oscillations.
+# For small x, the factor a(x) is about x/6, which is the term tK/3 of the HKS for the curvature K; for large x, a(x) is
+# of order 1/x. So the matrix JᵀJ for the data's Jacobian J is about Σₜ wₜ a(tL)², where wₜ is the weight of the time t
+# and L is the Laplacian. Except for the first few, the eigenvalues of JᵀJ decrease with frequency, and on grids they
+# decrease even faster, because interpolation damps oscillations.
 class ConformalInformation(eqx.Module):
     """The preconditioner B½ (1 + L/λ₁)⁻³ B½, where B is the lumped mass and L is a Laplacian of the initial metric.
 
-    Applying the inverse takes three products with L. With the damping μ, the matrix JᵀJ + μB has eigenvalues of at
-    least about μ, and λ₁ is chosen so large that the preconditioner has the same lower bound.
+    Applying the preconditioner's inverse takes three products with L. For the data's Jacobian J and the damping μ, the
+    matrix JᵀJ + μB has eigenvalues of at least about μ; a large λ₁ gives the preconditioner the same lower bound.
     """
 
     unknowns: Nodal  # the conformal factors at the nodes
-    root: Float[Array, "n 1"]  # the square roots of the masses, relative to the mass of a cell
-    weights: list[Float[Array, "..."]]  # the weights of the edges along each axis
+    root: Float[Array, "n 1"]  # the square roots of the nodal masses, relative to their mean
+    weights: list[Float[Array, "..."]]  # the weights of the grid's edges along each axis
     level: Float[Array, ""]  # the parameter λ₁ without damping
-    largest: Float[Array, ""]  # a bound on the eigenvalues of L
+    largest: Float[Array, ""]  # an upper bound on the eigenvalues of the Laplacian L
 
     def precondition(self, values: Values, damping: Float[Array, ""]) -> Values:
-        """Return the product of the operator's inverse with the unknowns, for the damping μ."""
+        """Return the product of the preconditioner's inverse with the unknowns, for the damping μ."""
         fall = jnp.maximum(_TOP / damping, 1.01) ** (1 / _POWER)
         level = jnp.maximum(self.level, self.largest / (fall - 1))
         y = values / self.root
@@ -108,7 +111,7 @@ class ConformalInformation(eqx.Module):
 
 @jit_quickly(eqx.filter_jit)
 def conformal_information(unknowns: Nodal, mass: InnerProduct, times: Float[Array, " n_times"]) -> ConformalInformation:
-    """Return the preconditioner for signatures at these times; `mass` is the inner product with ℓ = 0."""
+    """Return the preconditioner for fits to the HKS at the given times; `mass` is a `Smoothing` of length ℓ = 0."""
     grid, nodes = unknowns.init.grid, unknowns.nodes.value
     relative = mass.apply(unknowns.start() + 1)
     at_nodes = jnp.zeros(grid.size, relative.dtype).at[nodes].set(relative[:, 0]).reshape(grid.shape)

@@ -41,9 +41,10 @@ def fit_metric(
     """Find a metric with a given signature.
 
     The fit minimises half the weighted mean square of the differences between predicted and given signature, plus the
-    penalties of the regularisers. Isometric metrics have the same signature, and high frequencies of a metric affect
-    its signature little. So the steps are damped and, by default, smooth. Steps first change the directions that the
-    data determine. The result states how the fit ended; a fit that stalls or is interrupted raises no error.
+    penalties of the regularisers. Because isometric metrics have the same signature, and high frequencies of a metric
+    affect its signature little, the steps of the fit are damped and, by default, smooth. Damped steps first change
+    those combinations of unknowns that the data determine. A fit that stalls or is interrupted raises no error; the
+    result states how the fit ended.
 
     Args:
         init: the initial metric: a field, or a grid for the flat metric. The fit keeps properties of the field that the
@@ -57,11 +58,12 @@ def fit_metric(
             eigenvalues of `init`), a `Parametrisation`, or `Free` parameters of a function.
         data: the kind of signature, the measure of differences, and the weights and noise of entries.
         regularisers: penalties from `hks_jax.inverse`: `H1`, `TotalVariation`, `LogDeterminant`, `Prior`.
-        k: the number of eigenpairs. By default, the pairs beyond k contribute a share of 1e-6 to the heat trace at the
-            smallest time, by Weyl's law, or k is maximal. The default k increases if the fit reaches a field of more
-            volume. For a wave kernel signature of width σ, energies up to 2σ above the largest energy are included.
+        k: the number of eigenpairs. By default, eigenpairs beyond k contribute a share of 1e-6 to the heat trace at the
+            smallest time, by Weyl's law. If the grid has too few nodes for this share, the default k is maximal. The
+            default k increases if the fit reaches a field of more volume. For a wave kernel signature of width σ, the
+            default k includes energies up to 2σ above the largest one of `times`.
         boundary: the same as for `eigenpairs`.
-        solver: the eigensolver; ``"auto"`` chooses a solver that suits many products with the same Jacobian.
+        solver: the eigensolver; ``"auto"`` chooses a solver that suits many products with one Jacobian.
         search: the settings of the optimisation and its stopping criteria.
         progress: a function, such as ``print``, that is called with each step.
         checkpoint: a file that is written after each step. If the file exists, the fit resumes from it.

@@ -20,32 +20,30 @@ _Options = dict[str, Any]
 _Tags = frozenset[object]
 
 _TIGHTER, _LONGER = 30, 3
-"""The factors of the accuracy and of the maximum number of products in the linear system of a step that may be last."""
+"""The linear system of a possible last step is solved 30 times more accurately, in up to 3 times as many iterations."""
 _ACCEPTED, _GOOD, _SHRINKING = 0.01, 0.5, 0.25
-"""The shares of the predicted reduction to accept a step and to reduce damping; the step size's factor on rejection."""
+"""A step is accepted if it achieves 1 % of the predicted reduction of the misfit. Damping decreases if a step achieves
+half of the predicted reduction, and increases fourfold if a step is rejected."""
 _FREE = 0.01
-"""A step estimates the distance to the solution if damping contributes at most this share of its curvature."""
+"""The solver converges only if damping contributes less than 1 % of the curvature along the last step."""
 
 
 class _State(eqx.Module):
-    """The state of the solver."""
-
-    first: Bool[Array, ""]  # whether no unknowns have been accepted yet
-    trial: Values  # the unknowns to be evaluated next
+    first: Bool[Array, ""]  # whether the initial unknowns have not been evaluated yet
+    trial: Values  # the trial point: the unknowns to be evaluated next
     finite: Bool[Array, ""]  # whether the last step is finite
-    step_size: Float[Array, ""]  # 1/μ for the damping μ, relative to the first step
-    linearised: Any  # residuals and Jacobian at the last accepted unknowns
-    aux: Any  # the auxiliary output of the residuals at these unknowns
-    gradient: Values  # the gradient at these unknowns
-    promised: Float[Array, ""]  # the linearised change of half the sum of squares by the last step
+    step_size: Float[Array, ""]  # the initial damping, divided by the current damping μ
+    linearised: Any  # the residuals and the Jacobian at the last accepted unknowns
+    aux: Any  # the auxiliary output of the residuals at the last accepted unknowns
+    gradient: Values  # the gradient at the last accepted unknowns
+    promised: Float[Array, ""]  # the predicted change of half the sum of squares at the trial point
     change: Float[Array, ""]  # the size of the last accepted step, relative to the tolerance
-    damped: Float[Array, ""]  # xᵀBx / curvature for this step x; μ times this ratio is the share of damping
-    tight: Bool[Array, ""]  # whether the linear systems are solved more exactly
-    done: Bool[Array, ""]  # whether the descent has converged
+    damped: Float[Array, ""]  # the damping's share of the curvature along the last accepted step, divided by μ
+    tight: Bool[Array, ""]  # whether linear systems are solved accurately enough for a last step
+    done: Bool[Array, ""]  # whether the last accepted steps satisfy the tolerance
 
 
 def _linearise(fn: Callable, values: Values, args: Any) -> tuple[Any, Any]:
-    """Return residuals with their linearisation, and their auxiliary output."""
     residual, product, aux = jax.linearize(lambda v: fn(v, args), values, has_aux=True)
     jacobian = lx.FunctionLinearOperator(product, jax.eval_shape(lambda: values))
     return optx.FunctionInfo.ResidualJac(residual, jacobian), aux
@@ -59,19 +57,19 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _State]):
     """The default solver of `hks_jax.fit_metric`.
 
     For the residuals r with the Jacobian J, a step δ satisfies (JᵀJ + μB) δ = −Jᵀr, where B is an inner product of the
-    unknowns and μ is the damping. The conjugate gradients for this system stop early, because far from the solution the
-    linearisation error exceeds the algebraic error. Whenever the iteration stops, it returns a descent direction.
+    unknowns and μ is the damping. Conjugate gradients solve the linear system for δ roughly, because far from the
+    solution the linearisation error exceeds the algebraic error. Conjugate gradient iterates are descent directions.
 
-    The settings are arrays, so a compiled step works for all their values.
+    The solver's settings are arrays, so a compiled step works for all values of the settings.
 
     Args:
         tolerance: the relative and absolute change of the unknowns (root mean square) at which the solver stops.
         damping: the damping μ of the first step, relative to the scale of the data.
-        growth: the divisor of μ after a step that reduces the misfit as much as its linearisation predicts.
+        growth: the divisor of the damping μ after a step that achieves more than half of the predicted reduction.
         inner_product: the inner product B, in whose norm steps are damped.
-        inner_tolerance: the relative residual at which a linear solve ends; 30 times smaller if a step may be the last.
-        inner_steps: the maximum number of products with JᵀJ in a step; three times larger if the step may be the last.
-        preconditioner: the preconditioner of the conjugate gradients; B by default.
+        inner_tolerance: the relative residual of conjugate gradients, divided by 30 if the step may be the last.
+        inner_steps: the maximum number of products with JᵀJ in a step, multiplied by 3 if the step may be the last.
+        preconditioner: the preconditioner of the conjugate gradients, by default the inner product B.
 
     Examples:
         >>> import optimistix
@@ -112,34 +110,36 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _State]):
         self.preconditioner = preconditioner or self.inner_product
 
     def accepted(self, y: Values, state: _State) -> _State:
-        """Return the state after the step from y to the trial; the next step computes the gradient at the trial."""
+        """Return the state after the step from the unknowns y to the trial point, still with the gradient at y."""
         step = state.trial - y
         change = optx.rms_norm(step / (self.rtol * (1 + jnp.abs(state.trial))))
         moved, curvature = change > 0, -jnp.vdot(step, state.gradient)
         damped = jnp.vdot(step, self.inner_product.apply(step)) / jnp.where(curvature > 0, curvature, 1)
         damped = jnp.where(moved & (curvature > 0), damped, jnp.inf)
-        # The distance to the solution is about this step or, if larger, the rest of a geometric series of the steps.
+        # The distance to the solution is estimated by the last step or, if larger, a geometric series of future steps.
         ratio = change / state.change
         settled = moved & (ratio < 1) & (change * jnp.maximum(1, ratio / (1 - ratio)) < 1)
-        # The next step may be the last: it is below the tolerance if the steps keep shrinking at this rate.
+        # The next step may be the last if the ratio of the last two steps predicts that it is below the tolerance.
         near = moved & jnp.isfinite(state.change) & (change**2 < state.change)
         change = jnp.where(moved, change, jnp.inf)
         tight, done = state.tight | near | settled, state.tight & settled
         return dataclasses.replace(state, change=change, damped=damped, tight=tight, done=done)
 
     def _done(self, state: _State) -> Bool[Array, ""]:
-        """Return whether the unknowns have converged, and do not merely change little because of damping."""
+        """Return whether the steps satisfy the tolerance, and are not small merely because of damping."""
         return state.done & (self.damping / state.step_size * state.damped < _FREE)
 
-    # Let g = Jᵀr and (JᵀJ + μB) x = g − ρ. Conjugate gradients make the residual ρ orthogonal to x, so for δ = −x
+    # For the residuals r and the Jacobian J, let g = Jᵀr be the gradient. Conjugate gradients find an approximate
+    # solution x of (JᵀJ + μB) x = g with the damping μ and the inner product B, so that the residual g − (JᵀJ + μB) x
+    # is orthogonal to x. Therefore the linearisation predicts that the step δ = −x changes half the sum of squares by
     #
     #     ½|r + Jδ|² − ½|r|² = −gᵀx + ½ xᵀJᵀJx = −½ (gᵀx + μ xᵀBx).
     def _next(self, y: Values, state: _State, needed: bool | Bool[Array, ""]) -> _State:
-        """Return the state with the gradient at y, and with the next trial, which is y after convergence."""
+        """Return the state with the gradient at the unknowns y and with the next trial point (y after convergence)."""
         jacobian, residual, shape = state.linearised.jac, state.linearised.residual, y.shape
         adjoint, damping = jacobian.transpose(), self.damping / state.step_size
 
-        # The program contains J and Jᵀ only once, because they dominate the compilation time.
+        # The compiled program contains J and Jᵀ only once, because the Jacobian dominates the compilation time.
         def normal(x: Array, first: Bool[Array, ""]) -> tuple[Array, float]:
             x = x.reshape(shape)
             image = adjoint.mv(jax.lax.cond(first, lambda: residual, lambda: jacobian.mv(x)))
@@ -164,7 +164,7 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _State]):
     def init(
         self, fn: Callable, y: Values, args: Any, options: _Options, f_struct: Any, aux_struct: Any, tags: _Tags
     ) -> _State:
-        """Return the state before the first step, which evaluates ``y``."""
+        """Return the initial state, whose trial point is the initial unknowns ``y``."""
         structure, _ = eqx.filter_eval_shape(_linearise, fn, y, args)
         known = _empty(structure), _empty(aux_struct), jnp.zeros_like(y)
         yes, (zero, one, far) = jnp.asarray(True), jnp.asarray([0, 1, jnp.inf], y.dtype)
@@ -173,13 +173,13 @@ class GaussNewton(optx.AbstractLeastSquaresSolver[Values, Any, Any, _State]):
     def step(
         self, fn: Callable, y: Values, args: Any, options: _Options, state: _State, tags: _Tags
     ) -> tuple[Values, _State, Any]:
-        """Accept or reject the trial, and choose the next; return the unknowns and the auxiliary output.
+        """Accept or reject the trial point, choose the next one, and return the unknowns and the auxiliary output.
 
-        Choosing the next trial is most of the work. The choice is skipped if the function ``options["enough"]`` returns
-        true for the auxiliary output.
+        Conjugate gradients for the next trial point take most of a step's time, and are skipped if the function
+        ``options["enough"]`` returns true for the auxiliary output.
         """
         linearised, aux = _linearise(fn, state.trial, args)
-        # Traces are compared by identity, so the trace of the state is used in all states.
+        # Jaxprs are compared by identity, so each new state keeps the jaxpr of the previous state.
         linearised = eqx.combine(
             eqx.filter(linearised, eqx.is_array), eqx.filter(state.linearised, eqx.is_array, inverse=True)
         )

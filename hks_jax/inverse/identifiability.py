@@ -1,4 +1,4 @@
-"""The information of data about the unknowns of a fit: the spectrum of JᵀJ, resolution and uncertainty."""
+"""The information of data about the unknowns of a fit: the eigenpairs of JᵀJ for the data's Jacobian J."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,27 +17,27 @@ from hks_jax.linear import lapack
 from hks_jax.linear.chebyshev import chebyshev_recurrence
 
 _ROUNDS = 4
-"""The number of rounds of Chebyshev filtering for the weakest directions. Each round continues the previous one."""
+"""The number of rounds of Chebyshev-filtered subspace iteration for the smallest eigenvalues of JᵀJ."""
 
 
 class Identifiability(eqx.Module):
-    """The directions that noisy data determine near a solution, to first order.
+    """The combinations of unknowns that noisy data determine, from a linearisation of the data at a solution.
 
-    For independent residuals with the standard deviation σ and the Jacobian J, the information about the unknowns is
-    JᵀJ/σ². With a prior of standard deviation τ, the data determine the share s²/(s² + σ²/τ²) of an eigenvector of JᵀJ
-    with the eigenvalue s², and the prior determines the rest. The prior is white, so it does not couple neighbours.
+    For m observed entries with independent noise of standard deviation σ, the information about the unknowns is m
+    JᵀJ/σ², where J is the Jacobian of the weighted residuals. With a prior of standard deviation τ, the data determine
+    the share s²/(s² + σ²/(mτ²)) of an eigenvector of JᵀJ with the eigenvalue s², and the prior determines the rest. The
+    prior is white, so unknowns at neighbouring nodes are a priori independent.
 
     Attributes:
-        strengths: (n,) the largest eigenvalues s² of JᵀJ in descending order, for unit residual variance.
-        directions: (n, *values) the normalised eigenvectors of JᵀJ for these eigenvalues.
-        weak_strengths: (n_weak,) upper estimates of the smallest eigenvalues in ascending order.
-        weak_directions: (n_weak, *values) the directions that the data determine least.
-        resolution: (nodes,) a lower bound, from n directions, on the share of each node's unknowns that data determine.
-        deviation: (nodes,) the posterior standard deviation of each node's unknowns (root mean square) from the n
-            directions. To first order, it is at least the exact deviation under a white prior, that is, for
-            independent unknowns with standard deviation τ. A prior that couples neighbours reduces the deviation.
-        effective: the number of unknowns that the data determine, Σ s²/(s² + σ²/τ²) over the n directions.
-        noise: the standard deviation σ of the residuals.
+        strengths: (n,) the largest eigenvalues s² of JᵀJ in descending order.
+        directions: (n, *values) the normalised eigenvectors of JᵀJ for the eigenvalues in `strengths`.
+        weak_strengths: (n_weak,) upper bounds on the smallest eigenvalues of JᵀJ in ascending order.
+        weak_directions: (n_weak, *values) the combinations of unknowns that the data determine least.
+        resolution: (nodes,) the share of each node's unknowns that data determine; a lower bound from n eigenvectors.
+        deviation: (nodes,) the posterior standard deviation of each node's unknowns (root mean square); an upper bound
+            from n eigenvectors. A prior that correlates neighbouring nodes would give smaller standard deviations.
+        effective: the number of unknowns that data determine, as the sum of the determined shares of n eigenvectors.
+        noise: the standard deviation σ of the residuals before weighting.
         prior: the standard deviation τ of the prior.
     """
 
@@ -69,24 +69,25 @@ def identifiability(
     iterations: int = 4,
     seed: int = 0,
 ) -> Identifiability:
-    """Find the directions that the data of a fit determine, from products with the Jacobian J and with Jᵀ.
+    """Find the combinations of unknowns that the data of a fit determine best and least.
 
-    The strongest directions result from randomised subspace iteration on JᵀJ (Halko, Martinsson and Tropp 2011). The
-    weakest directions result from subspace iteration with Chebyshev polynomials that damp strong directions. Weak
-    directions include isometries that preserve the observation, checkerboards, and changes far from observations.
+    Each combination is an eigenvector of JᵀJ, where J is the Jacobian of the data. Randomised subspace iteration
+    computes the largest eigenvalues (Halko, Martinsson and Tropp 2011). Subspace iteration with Chebyshev polynomials
+    that damp large eigenvalues computes the smallest eigenvalues. Data hardly determine isometries that preserve the
+    observation, checkerboard patterns, and changes far from the observed nodes.
 
     Args:
-        fit: the result of `fit_metric`, or its problem.
-        values: the values at which to linearise, by default the fit's solution.
-        n: the number of strong directions.
-        n_weak: the number of weak directions.
-        noise: σ, the standard deviation of each entry's residual before weighting (0.01 for 1 % under ``"log"``).
-        prior: τ, the prior standard deviation of every single unknown, in the units of the parametrisation.
-        iterations: the number of subspace iterations. An iteration takes n + 8 products with J and n + 8 with Jᵀ.
+        fit: the result of `fit_metric`, or the attribute `MetricFit.problem` of the result.
+        values: the unknowns at which to linearise the data, by default the fit's solution.
+        n: the number of eigenvectors for the largest eigenvalues.
+        n_weak: the number of eigenvectors for the smallest eigenvalues.
+        noise: the standard deviation σ of each residual before weighting; 0.01 means 1 % for the loss ``"log"``.
+        prior: the prior standard deviation τ of every single unknown, in the units of the parametrisation.
+        iterations: the number of subspace iterations. Each iteration multiplies n + 8 vectors by JᵀJ.
         seed: the seed of the random initial subspace.
 
     Raises:
-        ValueError: if a problem is given without values, or if n is out of range.
+        ValueError: if `fit` is a problem and `values` is None, or if `n` or `n_weak` is out of range.
 
     Examples:
         >>> larger = hj.TensorField(field.grid, 1.1 * field.tensors)
@@ -98,7 +99,7 @@ def identifiability(
     problem = fit.problem if isinstance(fit, MetricFit) else fit
     values = fit.values if isinstance(fit, MetricFit) and values is None else values
     if values is None:
-        raise ValueError("values: got None for a problem; expected the values of the unknowns at which to linearise")
+        raise ValueError("values: got None, but fit is a problem without a solution; expected the problem's unknowns")
     total = values.size
     if not 1 <= n <= total or not 1 <= n_weak <= total:
         raise ValueError(f"n, n_weak: got {n}, {n_weak}; expected 1 to {total}, the number of unknowns")
@@ -111,7 +112,7 @@ def identifiability(
     weak_start = jax.random.normal(keys[1], (min(n_weak + 4, total), total), values.dtype)
     weak, weak_directions = _weakest(problem, values, weak_start, strengths[0], 2 * iterations)
 
-    # The weights of m entries add up to one, so weighted residuals have the mean variance σ²/m.
+    # The weights of the m observed entries add up to one, so weighted residuals have the mean variance σ²/m.
     variance = noise**2 / problem.observation.target.size
     strengths, directions = strengths[:n], directions[:n].reshape(n, *values.shape)
     weak_directions = weak_directions[:n_weak].reshape(n_weak, *values.shape)
@@ -148,7 +149,7 @@ def _weakest(problem: Problem, values: Values, start: Array, top: Float[Array, "
 
     def improve(_: Any, state: tuple[Array, Array]) -> tuple[Array, Array]:
         values, block = state
-        # The Chebyshev polynomial is small between the weak eigenvalues' mean and the top, and grows below this mean.
+        # The Chebyshev polynomial is small between the mean Ritz value and the largest eigenvalue, and large below.
         cut = jnp.mean(values)
         centre, half = (1.1 * top + cut) / 2, (1.1 * top - cut) / 2
 

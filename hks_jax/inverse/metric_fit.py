@@ -31,17 +31,17 @@ RESULTS = {
 
 @dataclasses.dataclass(frozen=True)
 class Step:
-    """One step of a fit.
+    """The record of one step of a fit.
 
     Attributes:
-        step: the number of the step; 0 belongs to the initial unknowns. Optimistix reports only accepted steps.
+        step: the number of the step; step 0 evaluates the initial unknowns. Optimistix reports only accepted steps.
         loss: half the weighted mean square of the residuals, plus the penalties.
         misfit: the data's part of the loss.
         gradient: the norm of the loss's gradient; NaN for least squares solvers of optimistix, which do not compute it.
         accepted: whether the step was accepted.
         seconds: the time since the fit began.
-        stage: the number of the stage of the continuation.
-        start: the number of the start.
+        stage: the index of the continuation stage; later stages fit smaller times.
+        start: the index of the initial guess; 0 is the initial field, others are random changes of this field.
     """
 
     step: int
@@ -88,11 +88,11 @@ class MetricFit:
         truncation_misfit: an estimate of the misfit between the metric's signatures from k and from all eigenpairs; 0
             for signatures that the k pairs define.
         history: one entry for each step.
-        result: a key of `RESULTS`, whose values explain the keys.
+        result: how the fit ended, for example ``"converged"``, ``"steps exhausted"`` or ``"stalled"``.
         values: the unknowns of the parametrisation.
         problem: the least squares problem, for `identifiability` and for custom fits.
-        losses: the loss of each start.
-        noise: the standard deviation of the residuals, as stated or from the target's deviation; otherwise None.
+        losses: the final loss for each initial guess.
+        noise: the standard deviation of the residuals, from `Data.noise` or `Data.deviation`; None if both are None.
     """
 
     field: TensorField
@@ -113,8 +113,8 @@ class MetricFit:
 
     @property
     def steps(self) -> int:
-        """The number of computed steps in all stages and starts."""
-        # Step 0 of a stage or of a resumed fit changes nothing.
+        """The number of computed steps in all stages and from all initial guesses."""
+        # Step 0 of a stage or of a resumed fit only evaluates the loss, so it does not count.
         return sum(step.step > 0 for step in self.history)
 
     @property
@@ -125,18 +125,18 @@ class MetricFit:
     def uncertainty(self, prior: float = 1.0, noise: float | None = None, draws: int = 32, seed: int = 0) -> Posterior:
         """Compute first-order error bars of the fitted metric by Laplace's approximation.
 
-        The posterior of the unknowns has the covariance (JᵀΣ⁻¹J + R)⁻¹, where J is the Jacobian of the data, Σ is the
-        covariance of the noise by the weights of the fit, and R is the Hessian of the penalties and of a white prior.
-        Each draw solves one linear system by conjugate gradients.
+        The covariance of the posterior is (JᵀΣ⁻¹J + R)⁻¹, where J is the Jacobian of the data and R is the Hessian of
+        the penalties and a white prior. The noise covariance Σ is diagonal, and its variances are inversely
+        proportional to the fit's weights. Each draw solves one linear system by conjugate gradients.
 
         Args:
-            prior: the standard deviation of every unknown without data, in the parametrisation's units.
+            prior: the prior standard deviation of every unknown, in the parametrisation's units.
             noise: the standard deviation of the residuals, by default `MetricFit.noise`.
-            draws: the number of draws; the relative error of a deviation is 1/√(2·draws).
+            draws: the number of draws; the relative error of a standard deviation is 1/√(2·draws).
             seed: the seed of the draws.
 
         Raises:
-            ValueError: if neither the fit nor the argument states a noise.
+            ValueError: if neither the fit nor the argument `noise` gives the standard deviation of the residuals.
         """
         noise = self.noise if noise is None else noise
         if noise is None:
@@ -144,7 +144,7 @@ class MetricFit:
         require_number("noise", noise)
         require_number("prior", prior)
         require_count("draws", draws)
-        # The weights of m entries add up to one, so weighted residuals have the mean variance σ²/m.
+        # The weights of the m observed entries add up to one, so weighted residuals have the mean variance σ²/m.
         scale = math.sqrt(self.problem.observation.target.size) / noise
         dtype, keys = self.values.dtype, jax.random.split(jax.random.key(seed), draws)
         numbers = jnp.asarray(scale, dtype), jnp.asarray(prior, dtype)
@@ -154,8 +154,9 @@ class MetricFit:
         return f"MetricFit({self.result}: loss {self.loss:.3e} after {self.steps} steps)"
 
 
-# Let A be the Jacobian of the residuals. For independent standard normal ξ and ξ₀, the vector b = Aᵀξ + ξ₀/τ has the
-# covariance H = AᵀA + 1/τ². So the solution x of Hx = b has the covariance H⁻¹ (Papandreou and Yuille 2010).
+# Let A be the Jacobian of the residuals and τ the prior's standard deviation. For independent standard normal vectors ξ
+# and ξ₀, the vector b = Aᵀξ + ξ₀/τ has the covariance H = AᵀA + 1/τ². So the solution x of the linear system Hx = b has
+# the covariance H⁻¹ (Papandreou and Yuille 2010).
 @jit_quickly(eqx.filter_jit)
 def _deviations(
     problem: Problem, values: Values, scale: Float[Array, ""], prior: Float[Array, ""], keys: Array

@@ -31,7 +31,7 @@ LOSSES: dict[str, Loss] = {
 
 @dataclasses.dataclass(frozen=True)
 class Data:
-    """The kind of the target of `hks_jax.fit_metric`, and its weights and noise.
+    """The kind, the weights and the noise of the target of `hks_jax.fit_metric`.
 
     Attributes:
         signature: ``"hks"``, ``"heat-trace"``, ``"eigenvalues"`` (the lowest), the result of `wave_kernel`, or a
@@ -39,11 +39,11 @@ class Data:
         loss: ``"log"`` (differences of logarithms), ``"relative"``, ``"absolute"``, or a function that maps flat
             predicted and target values to residuals.
         weights: numbers ≥ 0 that broadcast to the target's shape; 0 at unobserved entries, where the target may be NaN.
-        noise: the standard deviation of the residuals (0.01 for 1 % under ``"log"``). The fit stops when the misfit
-            reaches this level (the discrepancy principle), which regularises the fit.
+        noise: the standard deviation of the residuals; 0.01 means 1 % for the loss ``"log"``. The fit stops when the
+            misfit reaches the level of the noise (the discrepancy principle), which regularises the fit.
         deviation: the standard deviation of the target's noise in the target's unit, broadcast to its shape, for
             example from `hks_jax.uncertainty`. The weights are divided by the square of the deviation, and by default
-            `noise` follows from the deviation. Correlations of the noise are ignored.
+            `noise` follows from the deviation. The fit ignores correlations of the noise between entries.
 
     Raises:
         ValueError: if the signature or loss is unknown, if the noise is not positive, or if a loss function has a
@@ -90,7 +90,7 @@ class Observation(eqx.Module):
     def predict(self, pairs: Eigenpairs) -> Array:
         """Return the whole signature."""
         values = self.signature.predict(pairs, self.times)
-        return values[: self.shape[0]] if self.signature.lowest else values  # more pairs may have been computed
+        return values[: self.shape[0]] if self.signature.lowest else values  # complete multiplets may add eigenvalues
 
     def pairs_needed(self, k: int | None, pencil: AnyPencil, field: TensorField) -> int:
         """Return the number of eigenpairs to compute: k, or enough for the observed times."""
@@ -102,7 +102,7 @@ class Observation(eqx.Module):
         return self.compare(self.predict(pairs))
 
     def compare(self, predicted: Array) -> Float[Array, " m"]:
-        """Return the residuals of a signature with the target's shape."""
+        """Return the residuals of a predicted signature that has the target's shape."""
         return self.root_weights * self.loss(predicted.reshape(-1)[self.entries.value], self.target)
 
     def truncation_misfit(self, pairs: Eigenpairs) -> Float[Array, ""]:
@@ -163,10 +163,10 @@ def observe(target: Any, times: Any, data: Data, space: FunctionSpace, dtype: An
         raise ValueError("weights: got negative, infinite or NaN weights; expected numbers ≥ 0 (0: not observed)")
     used = (given > 0) & (space.free if signature.at_nodes else True)
     if signature.lowest:
-        used &= np.arange(values.size) >= space.n_null  # null eigenvalues are zero for every metric
+        used &= np.arange(values.size) >= space.n_null  # constants have the eigenvalue 0 for every metric
     if not used.any():
         raise ValueError("weights: got only zeros inside the domain; expected a positive weight at some entry")
-    remedy = "Give them the weight 0, take their nodes out of the mask, or correct them"
+    remedy = "Correct the invalid values, give them the weight 0, or remove their nodes from the mask"
     _refuse("target", values, used & ~np.isfinite(values), used, "NaN or infinite", remedy)
     if data.loss in ("log", "relative"):
         _refuse("target", values, used & (values <= 0), used, "not positive", remedy)
@@ -187,7 +187,7 @@ def observe(target: Any, times: Any, data: Data, space: FunctionSpace, dtype: An
 def _weights(
     values: np.ndarray, given: np.ndarray, used: np.ndarray, data: Data
 ) -> tuple[Float[np.ndarray, " m"], float | None]:
-    """Return the weights of observed values, with factors from the deviation, and the mean deviation of a residual."""
+    """Return the observed values' weights divided by squared deviations, and the residuals' standard deviation or None."""
     given, noise = given[used], data.noise
     if data.deviation is None:
         return given, noise
@@ -209,7 +209,6 @@ def _broadcast(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _refuse(name: str, values: np.ndarray, bad: np.ndarray, used: np.ndarray, what: str, remedy: str) -> None:
-    """Raise ValueError if observed values are invalid."""
     if bad.any():
         first = tuple(int(i) for i in np.argwhere(bad)[0])
         raise ValueError(

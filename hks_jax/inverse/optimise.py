@@ -21,10 +21,7 @@ _REJECTIONS = 12
 
 
 def _residuals(values: Values, problem: Problem) -> tuple[Array, Outcome]:
-    """Return residuals and, as auxiliary output, the outcome.
-
-    The root of the number of nodes multiplies the residuals, so the curvature along a step is of order 1 on every grid.
-    """
+    """Return the residuals, scaled by √n for n nodes so that the loss has curvatures of order 1, and the `Outcome`."""
     data, penalties, outcome = problem.evaluate(values)
     return jnp.sqrt(len(values)) * jnp.concatenate([data, penalties]), outcome
 
@@ -39,7 +36,7 @@ _objective = eqx.filter_custom_jvp(_half_squares)
 
 @_objective.def_jvp
 def _objective_jvp(primals: tuple, tangents: tuple) -> tuple:
-    """Compute the gradient with the value, so that its norm can be reported; all minimisers need the gradient."""
+    """Compute the loss and its gradient, whose norm is reported; all minimisers need the gradient."""
     (values, problem), (direction, _) = primals, tangents
     (value, outcome), gradient = jax.value_and_grad(_half_squares, has_aux=True)(values, problem)
     outcome = outcome._replace(gradient=jnp.linalg.norm(jnp.ravel(gradient)))
@@ -47,11 +44,10 @@ def _objective_jvp(primals: tuple, tangents: tuple) -> tuple:
     return (value, outcome), (jnp.sum(gradient * direction), constant)
 
 
-# A solver's state contains the trace of the residuals, and `_advance` is compiled again for another trace. The cache of
-# this function returns the same trace for all fits with the same shapes.
+# A solver's state contains the residual function as a jaxpr, and `_advance` is compiled again for a different jaxpr.
+# The cache of `_begin` returns the same jaxpr for all fits with the same shapes.
 @jit_quickly(eqx.filter_jit)
 def _begin(optimiser: Optimiser, fn: Callable, values: Values, problem: Problem) -> Any:
-    """Return the solver's state before the first step."""
     struct, aux_struct = eqx.filter_eval_shape(fn, values, problem)
     return _strongly_typed(optimiser.init(fn, values, problem, {}, struct, aux_struct, frozenset()))
 
@@ -60,7 +56,7 @@ def _begin(optimiser: Optimiser, fn: Callable, values: Values, problem: Problem)
 def _advance(
     optimiser: Optimiser, fn: Callable, values: Values, problem: Problem, state: Any, sufficient: Float[Array, ""]
 ) -> tuple:
-    """Take a step. Gauss–Newton does not choose the next step if the misfit is small enough."""
+    """Take a step. Gauss–Newton computes no further step once the misfit is at most `sufficient`."""
 
     def enough(outcome: Outcome) -> Bool[Array, ""]:
         return outcome.misfit <= sufficient
@@ -84,7 +80,7 @@ class Reached(NamedTuple):
     """The end of a search."""
 
     values: Values  # the unknowns
-    outcome: Outcome | None  # loss and misfit at these unknowns; None if not computed
+    outcome: Outcome | None  # loss and misfit at the unknowns; None if not computed
     result: str  # one of the keys of `metric_fit.RESULTS`
 
     @property
@@ -96,7 +92,7 @@ class Reached(NamedTuple):
 def optimise(
     problem: Problem, values: Values, optimiser: Optimiser, noise: float | None, max_steps: int, log: Callable
 ) -> Reached:
-    """Run until convergence, the noise level or the number of steps stops the fit; return the best unknowns."""
+    """Take steps until a stopping criterion of the fit is met, and return the unknowns with the smallest loss."""
     fn = _residuals if isinstance(optimiser, optx.AbstractLeastSquaresSolver) else _objective
     best, least, seen = Reached(values, None, ""), np.inf, None
     rejected, number, end = 0, 0, ""

@@ -22,21 +22,22 @@ from hks_jax.inverse.unknowns import Unknowns, Values
 from hks_jax.signatures.truncation import resolving
 
 _NEAR = 0.1
-"""A warning is issued if truncation causes more than this share of the misfit (about a third of the residuals)."""
+"""A warning is issued if truncation causes more than a tenth of the misfit, that is, a third of the residuals."""
 _ENOUGH = 1e-5
-"""The least tolerance of the solver's derivative for which single precision suffices. For the Jacobian J on 64² nodes,
-single precision causes errors of 1e-6 in J and up to 3e-5 in Jᵀ; this tolerance causes errors of 5e-6 and 5e-5."""
+"""Single precision suffices for the derivative of residuals if the derivative of eigenpairs has a tolerance of at least
+1e-5. For the Jacobian J on 64² nodes, single precision causes errors of 1e-6 in J and up to 3e-5 in Jᵀ, and the
+tolerance 1e-5 causes errors of 5e-6 in J and 5e-5 in Jᵀ."""
 
 
 class Outcome(NamedTuple):
-    """The result of an evaluation at some unknowns."""
+    """The loss of a fit at given unknowns, with its parts and the eigenpairs."""
 
     loss: Float[Array, ""]  # half the weighted mean square of the residuals, plus the penalties
     misfit: Float[Array, ""]  # the data's part of the loss
     truncation: Float[Array, ""]  # see `Observation.truncation_misfit`
-    pairs: Eigenpairs  # the eigenpairs, without their arrays at nodes and without their pencil
+    pairs: Eigenpairs  # the eigenpairs without eigenvectors and pencil
     values: Values  # the unknowns
-    gradient: Float[Array, ""]  # the norm of the gradient in the scale of the solver; NaN where it was not computed
+    gradient: Float[Array, ""]  # the norm of the gradient of the solver's objective; NaN if it was not computed
 
 
 class Problem(eqx.Module):
@@ -50,15 +51,15 @@ class Problem(eqx.Module):
     solver: str | Eigensolver = eqx.field(static=True)  # eigensolver
 
     def pairs(self, values: Values) -> Eigenpairs:
-        """Return the eigenpairs of the field with these values."""
+        """Return the eigenpairs of the field for given unknowns."""
         return self._pairs_of(self.unknowns.field(values))
 
     def _pairs_of(self, field: TensorField) -> Eigenpairs:
-        # The derivative exists only if a multiplet at k is included completely or not at all.
+        # The signature is differentiable only if k does not split a multiple eigenvalue.
         return eigenpairs(field, self.k, self.boundary, self.solver, multiplet="complete")
 
     def evaluate(self, values: Values) -> tuple[Float[Array, " m"], Float[Array, " r"], Outcome]:
-        """Return the residuals of the data, the residuals of the penalties, and the outcome."""
+        """Return the residuals of the data, the residuals of the penalties, and the loss with its parts."""
         field = self.unknowns.field(values)
         pairs = self._pairs_of(field)
         data = _residuals_of(self.observation, pairs, self.solver)
@@ -79,7 +80,7 @@ class Problem(eqx.Module):
 # A heat signature is at least the contribution of the constant eigenfunctions. Other signatures, and heat signatures
 # without constant eigenfunctions, may underflow in single precision, and logarithmic derivatives divide by signatures.
 def _residuals_of(observation: Observation, pairs: Eigenpairs, solver: str | Eigensolver) -> Float[Array, " m"]:
-    """Return the residuals, with a derivative in single precision if the solver's derivative is no more accurate."""
+    """Return the residuals, with a single precision derivative if the derivative of eigenpairs is no more accurate."""
     rough = isinstance(solver, Eigensolver) and solver.adjoint.tolerance >= _ENOUGH
     bounded = observation.signature.left_out is not None and pairs.n_null > 0
     return (_rough if rough and bounded else Observation.residuals)(observation, pairs)
@@ -103,17 +104,17 @@ def _in_single(tree: Any) -> Any:
 
 @jit_quickly(eqx.filter_jit)
 def outcome_of(problem: Problem, values: Values) -> Outcome:
-    """Return loss, misfit and eigenpairs at these unknowns."""
+    """Return loss, misfit and eigenpairs at given unknowns."""
     return problem.evaluate(values)[2]
 
 
 def truncation_shows(misfit: float, left: float) -> bool:
-    """Return whether truncation causes a large share of a misfit and exceeds `TAIL`."""
+    """Return whether truncation causes more than a tenth of the misfit, and relative errors above 2·`TAIL`."""
     return left > (2 * TAIL) ** 2 / 2 and left > _NEAR * misfit
 
 
 def more_pairs(problem: Problem, values: Values) -> int:
-    """Return a larger number of pairs, for a field that needs more than the problem has."""
+    """Return a number of eigenpairs that is larger than the problem's k, and suffices for the field of the unknowns."""
     field = problem.unknowns.field(values)
     pencil = assemble(field, problem.boundary)
     smallest = float(np.min(problem.observation.observed_times))

@@ -1,6 +1,6 @@
 """Regularisers, which select one of several solutions that explain the data of a fit.
 
-Each penalty is half a weighted mean of squares over the domain. The least squares problem includes these squares.
+Each penalty is half a weighted mean of squares over the domain, so a fit remains a least squares problem.
 """
 
 from abc import abstractmethod
@@ -16,7 +16,7 @@ from hks_jax.inverse.unknowns import Unknowns, Values
 
 
 class Regulariser(eqx.Module):
-    """A penalty on the unknowns or on the field: half the weighted sum of the squares of `deviations` over the nodes.
+    """A penalty on the unknowns or on the field: half the weighted mean square of `deviations` over the nodes.
 
     Attributes:
         weight: the factor of the penalty.
@@ -50,7 +50,7 @@ class H1(Regulariser):
     weight: float
 
     def deviations(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, "..."]:
-        """Return the slopes along the grid's edges."""
+        """Return the slopes of the parameters along the grid's edges."""
         return jnp.concatenate([slopes.ravel() for slopes in unknowns.slopes(values)])
 
 
@@ -75,9 +75,9 @@ class TotalVariation(Regulariser):
         require_number("epsilon", self.epsilon)
 
     def deviations(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, "..."]:
-        """Return gradients at the nodes, scaled so that half their square is the penalty."""
+        """Return the parameters' gradients at the nodes, scaled so that half the square is √(|∇p|² + ε²) − ε."""
         d = field.grid.dimension
-        # Differences to the next node along each axis are zero at the last node.
+        # At the last node of each axis, the difference to the next node is set to zero.
         gradient = jnp.stack(
             [
                 jnp.pad(slopes, [(0, 0)] + [(0, int(axis == along)) for axis in range(d)])
@@ -85,7 +85,7 @@ class TotalVariation(Regulariser):
             ]
         )
         square = jnp.sum(gradient**2, axis=(0, 1))
-        # The square of this factor is 2(√(s² + ε²) − ε)/s² without cancellation, where s is the gradient's norm.
+        # For the gradient's norm s, 2/(√(s² + ε²) + ε) equals 2(√(s² + ε²) − ε)/s² without cancellation.
         return gradient * jnp.sqrt(2 / (jnp.sqrt(square + self.epsilon**2) + self.epsilon))
 
 

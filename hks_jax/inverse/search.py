@@ -1,4 +1,4 @@
-"""The search for the unknowns of a fit: its methods, starts, stages and number of eigenpairs."""
+"""The search for the unknowns of a fit: optimisers, initial guesses, stages and the number of eigenpairs."""
 
 import dataclasses
 import os
@@ -31,17 +31,17 @@ class Search:
     Attributes:
         optimiser: ``"gauss-newton"`` (damped, matrix-free), ``"lbfgs"``, ``"bfgs"``, or a solver of optimistix.
         smoothness: the length, in coordinate units, below which Gauss–Newton steps are smooth, or 0 for steps without
-            smoothing. The default is a tenth of the domain, and 0 for ``"conformal"`` without noise.
+            smoothing. The default length is a tenth of the grid's longest side, or 0 for ``"conformal"`` without noise.
         tolerance: a fit has converged when the unknowns u change by less than the tolerance, relative to 1 + |u| (root
-            mean square). Both the last step and the sum of future steps must satisfy this criterion; a geometric series
-            predicts future steps. Linear systems of steps that may be the last are solved 30 times more exactly with
-            three times as many products. Directions that these products do not reach are ignored; `identifiability`
-            finds them. Solvers of optimistix test only the last step.
+            mean square). The last step and the predicted sum of all future steps must both be below the tolerance. If a
+            step may be the last, conjugate gradients solve its linear system 30 times more accurately, in up to 3 times
+            as many iterations. `identifiability` finds changes of the unknowns that hardly affect the data, for which
+            convergence is not tested. For solvers of optimistix, only the last step must be below the tolerance.
         max_steps: the maximum number of steps in each stage.
         continuation: the number of stages. The first stage fits only the largest times, the last stage fits all times.
-        starts: the number of starts: the initial field and random smooth changes of this field. The best fit is kept.
-        spread: the root mean square of the random changes, in the parameters' units.
-        seed: the seed of the random changes.
+        starts: the number of initial guesses: the initial field and its random smooth changes. The best fit is kept.
+        spread: the root mean square of the random changes of the initial field, in the parameters' units.
+        seed: the seed of the random changes of the initial field.
 
     Raises:
         ValueError: if the optimiser is unknown or a number is out of range.
@@ -87,7 +87,7 @@ def choose_inner_product(unknowns: Unknowns, smoothness: float | None, noise: fl
 
 
 _EARLY = 100.0
-"""The factor of the tolerance in stages before the last, which need less accuracy."""
+"""The tolerance is 100 times larger in all stages except the last, because earlier stages need less accuracy."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,10 +117,10 @@ class Run:
             save(self.path, self.mark, now)
 
     def solve(self, problem: Problem, values: Values, tolerances: float = 1.0, step_size: float = 1.0) -> Reached:
-        """Solve a problem from given unknowns; `tolerances` multiplies tolerances, and `step_size` divides damping."""
+        """Solve a problem from given unknowns, with the tolerance times `tolerances` and damping over `step_size`."""
         method, tolerance = self.search.optimiser, tolerances * self.search.tolerance
         if method == "gauss-newton":
-            # Noise requires small steps, because the misfit must not fall far below the noise.
+            # Noisy data require small steps, because the misfit must not fall far below the noise.
             damping, growth = (1e-4, 10.0) if self.noise is None else (1e-2, 3.0)
             known, preconditioner = self.inner_product, self._preconditioner(problem)
             method = GaussNewton(tolerance, damping / step_size, growth, known, preconditioner=preconditioner)
@@ -131,7 +131,6 @@ class Run:
             return optimise(problem, values, method, self.noise, self.search.max_steps, self.record)
 
     def _preconditioner(self, problem: Problem) -> InnerProduct | ConformalInformation:
-        """Return an approximation of JᵀJ if one is known, otherwise the inner product."""
         unknowns, observation = problem.unknowns, problem.observation
         if isinstance(unknowns, Nodal) and unknowns.parametrisation == PARAMETRISATIONS["conformal"]:
             rough = getattr(self.inner_product, "factor", None) is None
@@ -141,7 +140,7 @@ class Run:
         return self.inner_product
 
     def through_stages(self, problems: Sequence[Problem], values: Values, first: int, step_size: float) -> Reached:
-        """Solve the problems in order, beginning with number `first`; return the outcome of the last."""
+        """Solve the problems of successive stages from the index `first`; return the result of the last stage."""
         reached, last = Reached(values, None, "interrupted"), len(problems) - 1
         now = self.now
         for now.stage in range(first, len(problems)):
@@ -155,10 +154,10 @@ class Run:
         return reached
 
     def from_starts(self, problems: Sequence[Problem]) -> Reached:
-        """Return the best result of several starts: the recorded state, and random changes of the first unknowns."""
+        """Return the best fit from several initial guesses: the recorded state, and random changes of `first`."""
         now, start = self.now, self.now.start
         where = jnp.asarray(now.values), now.stage, now.step_size
-        if now.stage == len(problems):  # the fit already uses more eigenpairs, so all starts are complete
+        if now.stage == len(problems):  # all initial guesses were tried before the fit was interrupted
             return Reached(where[0], None, "converged")
         best = Reached(jnp.asarray(now.best), None, "interrupted")
         for now.start in range(start, self.search.starts):
@@ -176,7 +175,7 @@ class Run:
         return best
 
     def _moved(self, start: int) -> Values:
-        """Return the initial values of a further start, which are the first values plus smooth noise."""
+        """Return a random initial guess, which is the unknowns of the initial field plus smooth noise."""
         key = jax.random.fold_in(jax.random.key(self.search.seed), start)
         noise = self.inner_product.solve(jax.random.normal(key, self.first.shape, self.first.dtype))
         return self.first + self.search.spread * noise / jnp.sqrt(jnp.mean(noise**2))
@@ -184,9 +183,9 @@ class Run:
     def with_enough_pairs(
         self, reached: Reached, problem: Problem, renewed: Callable[[int], Problem] | None
     ) -> tuple[Reached, Problem]:
-        """Continue with more eigenpairs while truncation affects the fit, because k was chosen for the initial volume.
+        """Continue with more eigenpairs while truncation affects the fit, because the volume may have grown.
 
-        `renewed` returns the problem with a given number of eigenpairs; None keeps the number.
+        `renewed` returns the problem with a given number of eigenpairs; if `renewed` is None, the number is kept.
         """
         while True:
             outcome = reached.outcome or outcome_of(problem, reached.values)

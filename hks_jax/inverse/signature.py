@@ -20,9 +20,9 @@ from hks_jax.signatures.kernels import heat_trace, wks
 from hks_jax.signatures.truncation import resolving, truncation, truncation_map
 
 TAIL = 1e-6
-"""The share of the heat trace at the smallest time that may lie beyond the computed pairs."""
+"""The share of the heat trace at the smallest time that may lie beyond the computed eigenpairs."""
 _LOST = 0.05
-"""The share of the heat trace beyond all useful pairs at which a time counts as unresolvable."""
+"""A time is too small for a grid if more than 5 % of the heat trace lies beyond the accurate eigenpairs."""
 
 
 class Signature(eqx.Module):
@@ -46,7 +46,7 @@ class Signature(eqx.Module):
     sigma: Array | None = None
 
     def predict(self, pairs: Eigenpairs, times: Float[Array, " n"] | None) -> Array:
-        """Return the signature of the pairs."""
+        """Return the signature of the eigenpairs."""
         sigma = None if self.sigma is None or times is None else self.sigma.astype(times.dtype)
         return self.function(pairs, *(given for given in (times, sigma) if given is not None))
 
@@ -96,7 +96,7 @@ def pairs_below(eigenvalue: float, pencil: AnyPencil, field: TensorField) -> int
 
 
 def pairs_for(times: Any, pencil: AnyPencil, field: TensorField) -> int:
-    """Return the number of pairs that resolve the smallest time to `TAIL`, at most all pairs."""
+    """Return the number of eigenpairs whose heat trace lacks a share `TAIL` at the smallest time."""
     smallest, n_dof, d = float(np.min(np.asarray(times))), unknowns_of(pencil), pencil.space.dimension
 
     def count(tail: float) -> int:
@@ -117,7 +117,7 @@ def unknowns_of(pencil: AnyPencil) -> int:
 def _require_resolved(wanted: int, n_dof: int, what: str, remedy: str) -> None:
     """Warn if more eigenpairs are needed than are accurate; raise ValueError if more than twice as many are needed.
 
-    The factor 2 is allowed because a fit may start from a metric of more volume, which needs more eigenpairs.
+    An initial metric may need more eigenpairs than the fitted metric, and gets up to twice the usual number.
     """
     most = _most_pairs(n_dof)
     if wanted <= most:

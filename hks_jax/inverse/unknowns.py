@@ -23,7 +23,7 @@ Parameters = Float[Array, "n c"]
 
 
 def named(argument: str, given: Any, table: Mapping[str, Any], others: str) -> Any:
-    """Return a table's entry by its name; raise ValueError with the names and the alternatives for an unknown name."""
+    """Return the entry of a table with a given name, or raise ValueError that lists all names and `others`."""
     if isinstance(given, str) and given in table:
         return table[given]
     raise ValueError(f"{argument}: got {given!r}; expected {', '.join(map(repr, table))}, {others}")
@@ -50,7 +50,7 @@ class Parametrisation(eqx.Module):
 
 
 def _logarithm(base: Tensors) -> Parameters:
-    """Return the diagonal of log T and √2 times the entries below, whose norm is the Frobenius norm of log T."""
+    """Return the diagonal of log T and √2 times the entries below the diagonal, a vector with the norm of log T."""
     logarithm = spd.log(base)
     rows, columns = np.tril_indices(base.shape[-1], -1)
     diagonal = jnp.diagonal(logarithm, axis1=1, axis2=2)
@@ -66,7 +66,6 @@ def _exponential(parameters: Parameters, base: Tensors) -> Tensors:
 
 
 def _cholesky(base: Tensors) -> Parameters:
-    """Return the logarithms of the diagonal of L in T = LLᵀ, and the entries below the diagonal."""
     factor, d = spd.cholesky(base), base.shape[-1]
     rows, columns = np.tril_indices(d, -1)
     diagonal = jnp.diagonal(factor, axis1=1, axis2=2)
@@ -112,17 +111,16 @@ def _rotation(vector: Float[Array, "n 3"]) -> Tensors:
 
 
 def _zeros(count: Callable[[int], int]) -> Callable[[Tensors], Parameters]:
-    """Return a function that maps initial tensors (n, d, d) to zeros (n, count(d))."""
     return lambda base: jnp.zeros((len(base), count(base.shape[-1])), base.dtype)
 
 
 PARAMETRISATIONS = {
-    # The tensors are exp S, LLᵀ, e^u T₀, V diag(e^uᵢ λᵢ) Vᵀ and R T₀ Rᵀ, where V and λᵢ belong to T₀ = V diag(λᵢ) Vᵀ.
-    "log-euclidean": Parametrisation(_logarithm, _exponential),
-    "cholesky": Parametrisation(_cholesky, _from_cholesky),
-    "conformal": Parametrisation(_zeros(lambda d: 1), _scaled, smooth=False),
-    "eigenvalues": Parametrisation(_zeros(lambda d: d), _stretched),
-    "rotation": Parametrisation(_zeros(lambda d: 1 if d == 2 else 3), _turned),  # an angle, or a rotation vector
+    # The initial tensor is T₀ = V diag(λᵢ) Vᵀ, with eigenvectors in V and eigenvalues λᵢ.
+    "log-euclidean": Parametrisation(_logarithm, _exponential),  # T = exp S for a symmetric matrix S
+    "cholesky": Parametrisation(_cholesky, _from_cholesky),  # T = LLᵀ for a lower triangular matrix L
+    "conformal": Parametrisation(_zeros(lambda d: 1), _scaled, smooth=False),  # T = e^u T₀ for a number u
+    "eigenvalues": Parametrisation(_zeros(lambda d: d), _stretched),  # T = V diag(e^uᵢ λᵢ) Vᵀ for numbers uᵢ
+    "rotation": Parametrisation(_zeros(lambda d: 1 if d == 2 else 3), _turned),  # T = R T₀ Rᵀ for a rotation R
 }
 
 
@@ -131,14 +129,14 @@ class Unknowns(eqx.Module):
 
     @abstractmethod
     def start(self) -> Values:
-        """Return the values at the initial field."""
+        """Return the parameters of the initial field."""
 
     @abstractmethod
     def field(self, values: Values) -> TensorField:
-        """Return the field with these values."""
+        """Return the field with given parameters."""
 
     def slopes(self, values: Values) -> list[Float[Array, "c *edges"]]:
-        """Return the slopes of the values along the grid's edges for each axis; 0 if an end is outside the domain."""
+        """Return the parameters' slopes along the grid's edges of each axis, and 0 for edges that leave the domain."""
         raise ValueError(
             "regularisers: got a slope penalty, but the unknowns are parameters of a function and have no slopes on "
             "the grid; expected Prior or LogDeterminant"
@@ -163,7 +161,7 @@ class Nodal(Unknowns):
         return self.parametrisation.start(self._base)
 
     def field(self, values: Values) -> TensorField:
-        """Return the field with these parameters."""
+        """Return the field with given parameters."""
         grid = self.init.grid
         all_tensors = self.init.domain_tensors.reshape(-1, grid.dimension, grid.dimension)
         moved = self.parametrisation.tensors(values, self._base)
@@ -171,7 +169,7 @@ class Nodal(Unknowns):
         return TensorField(grid, full.reshape(self.init.domain_tensors.shape), self.init.interpolation)
 
     def slopes(self, values: Values) -> list[Float[Array, "c *edges"]]:
-        """Return the slopes of the parameters along the grid's edges for each axis; 0 if an end is outside."""
+        """Return the parameters' slopes along the grid's edges of each axis, and 0 for edges that leave the domain."""
         grid = self.init.grid
         domain = np.zeros(grid.size, dtype=bool)
         domain[self.nodes.value] = True
@@ -190,7 +188,7 @@ class Free(Unknowns):
     Attributes:
         function: maps the parameters to a `TensorField`, or to tensors on the grid of the initial field.
         parameters: the initial parameters, any pytree of floating point arrays.
-        init: the initial field, which gives tensors a grid and an interpolation; `fit_metric` sets it.
+        init: the initial field, whose grid and interpolation apply if `function` returns tensors; `fit_metric` sets it.
 
     Examples:
         >>> scaled = hj.inverse.Free(lambda s: s * field.tensors, jnp.array(1.1))
@@ -212,7 +210,7 @@ class Free(Unknowns):
         return ravel_pytree(jax.tree.map(jnp.asarray, self.parameters))[0]
 
     def field(self, values: Values) -> TensorField:
-        """Return the field with these parameters."""
+        """Return the field with given parameters."""
         tensors = self.function(ravel_pytree(jax.tree.map(jnp.asarray, self.parameters))[1](values))
         if isinstance(tensors, TensorField):
             return tensors

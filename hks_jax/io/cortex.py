@@ -1,8 +1,8 @@
 """Read surfaces in GIFTI and FreeSurfer's format through the optional library nibabel.
 
-FreeSurfer's surface coordinates have their origin at the centre c of a volume with the axes x̂, ŷ and ẑ. In surface
-coordinates, these axes are the vectors −e₁, −e₃ and e₂, which are the columns of the matrix S. So a vertex v has the
-scanner coordinates c + [x̂ ŷ ẑ] Sᵀv ([systems](https://surfer.nmr.mgh.harvard.edu/fswiki/CoordinateSystems)).
+A FreeSurfer vertex with the surface coordinates v has the scanner coordinates c + ASᵀv, where c is the centre of an
+image volume, and the columns of A and S are the volume's axes in scanner coordinates and in surface coordinates
+([systems](https://surfer.nmr.mgh.harvard.edu/fswiki/CoordinateSystems)).
 """
 
 import gzip
@@ -31,7 +31,7 @@ def is_freesurfer(path: Path) -> bool:
 
 
 _OWN_AXES = np.array([[-1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-"""The matrix S, whose columns are the axes of FreeSurfer's volumes in the coordinates of its surfaces."""
+"""The matrix S, whose columns are the axes of a FreeSurfer volume in surface coordinates."""
 _SCANNER = (1, 2)
 """NIfTI's codes for the scanner's coordinates, and for the coordinates of a volume aligned with the scanner."""
 
@@ -41,7 +41,7 @@ def load_freesurfer(path: Path, in_space: bool = False) -> Loaded:
     library = optional("nibabel")
     with reading(path, "a readable FreeSurfer surface"):
         content = path.read_bytes()
-        # The magic number and a remark end with the second line. The numbers of vertices and triangles follow.
+        # The numbers of vertices and triangles follow two lines that contain a magic number and a comment.
         start = content.index(b"\n", content.index(b"\n", len(_TRIANGLES)) + 1) + 1
         n_vertices, n_faces = np.frombuffer(content[start : start + 8], ">i4").tolist()
         end = start + 8 + 12 * (n_vertices + n_faces)
@@ -62,7 +62,7 @@ def load_freesurfer(path: Path, in_space: bool = False) -> Loaded:
 
 
 def _from_own_axes(path: Path, vertices: np.ndarray, axes: list[np.ndarray]) -> np.ndarray:
-    """Transform FreeSurfer's surface coordinates to scanner coordinates; `axes` contains x̂, ŷ, ẑ and the centre c."""
+    """Transform FreeSurfer's surface coordinates to scanner coordinates; `axes` has the volume's axes and centre."""
     if any(axis.shape != (3,) or not np.isfinite(axis).all() for axis in axes):
         raise ValueError(
             f"{path}: the file does not state the position of its volume (x_ras … c_ras), which scanner coordinates "

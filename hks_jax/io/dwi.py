@@ -22,7 +22,7 @@ from hks_jax.storage import existing, reading
 _LENGTH = 0.05
 """The largest difference of a direction's length from 1 that is attributed to rounding."""
 _SEEN = 0.01
-"""The ratio of a residual's variance to the variance of the noise above which the residual is used."""
+"""The least ratio of a residual's variance to the variance of the noise for which the residual is used."""
 
 
 class ExampleBrain(NamedTuple):
@@ -35,10 +35,10 @@ class ExampleBrain(NamedTuple):
 
 
 def find_example_brain() -> ExampleBrain | None:
-    """Return the files of the brain in the PyPI wheel ``mdt`` (104 × 104 × 2 voxels of 2 mm), or None if it is missing.
+    """Return the files of the brain in the PyPI wheel ``mdt`` (104 × 104 × 2 voxels of 2 mm), None without the wheel.
 
-    The scan has 13 images at b = 0, 30 at 1000 and 60 at 2000 s/mm². Install version 1.2.7 of the wheel (licence
-    LGPL-3.0-or-later) with ``--no-deps``. The function reads only the wheel's metadata, without importing the wheel.
+    The scan has 13 images at b = 0, 30 at 1000 and 60 at 2000 s/mm². Install ``mdt`` 1.2.7 (licence LGPL-3.0-or-later)
+    with ``--no-deps``. The function reads only the metadata of the wheel, without importing the wheel.
 
     Examples:
         >>> brain = hj.io.find_example_brain()
@@ -71,24 +71,24 @@ def fit_dwi(
     Args:
         path: a NIfTI image (nx, ny, nz, n). Voxels with a NaN or infinite signal are left out.
         bval: a text file of the n b-values, in s/mm² unless `unit` is given.
-        bvec: a text file of n directions, 3 × n or n × 3. Directions must have length 1, but are ignored at b = 0.
-        mask: a file (see `read_mask`) or a bool array (nx, ny, nz). Tensors outside the mask are zero. If None, DIPY's
-            median_otsu finds the brain in the mean of the unweighted images, and a note reports this.
-        b_max: the largest b-value used, in s/mm²; None uses all images. A tensor is a model for b ≲ 1000–1500 s/mm².
-        bvec_frame: the axes of the directions. ``"fsl"``, for files of dcm2niix and FSL, means the voxel axes, where
-            the first axis is reversed if the affine's determinant is positive. ``"voxel"`` means the voxel axes.
-            ``"world"`` means the scanner's axes, as in MRtrix.
+        bvec: a text file of the n gradient directions, 3 × n or n × 3. Directions must have length 1, except at b = 0.
+        mask: a file (see `read_mask`) or a bool array (nx, ny, nz). Tensors outside the mask are zero. If `mask` is
+            None, DIPY's median_otsu finds the brain in the mean of the unweighted images.
+        b_max: the largest b-value used, in s/mm², or None for all. The tensor model is valid for b ≲ 1000–1500 s/mm².
+        bvec_frame: the axes along which the gradient directions are given. ``"fsl"``, for files of dcm2niix and FSL,
+            means the voxel axes, where the first axis is reversed if the affine's determinant is positive. ``"voxel"``
+            means the voxel axes. ``"world"`` means the scanner's axes, as in MRtrix.
         unit: a unit of diffusivity whose reciprocal is the unit of the b-values: ``"m2/s"`` for b-values in s/m²,
-            ``"um2/ms"`` for ms/µm². None means mm²/s.
+            ``"um2/ms"`` for b-values in ms/µm². None means mm²/s.
         noise: the standard deviation of the images' noise, in the images' unit, from which the tensors' covariance is
-            computed. ``"residuals"`` estimates the deviation in each voxel from the residuals of the fit, which have
-            n − 7 degrees of freedom. The volume then also contains the contribution of each image to the noise
-            (`TensorVolume.modes`, 24 bytes for each voxel and image). If None, no covariance is computed.
+            computed. ``"residuals"`` estimates the deviation in each voxel from the residuals of the fit (n − 7 degrees
+            of freedom), and records the contribution of each image to the noise of the tensors (`TensorVolume.modes`,
+            24 bytes for each voxel and image). If `noise` is None, no covariance is computed.
 
     Returns:
         Tensors along the voxel axes, in mm²/s. If `noise` is given, the volume also describes the noise of the tensors
-        to first order (`TensorVolume.noise`). DIPY raises eigenvalues that are not positive to about 1e-9 mm²/s, and a
-        note reports the number of such voxels. Most such voxels are at the boundary of the mask; erosion removes them.
+        to first order (`TensorVolume.noise`). DIPY raises eigenvalues that are not positive to about 1e-9 mm²/s. A note
+        reports the number of voxels with raised eigenvalues; most lie at the boundary of the mask, see `erode`.
 
     Raises:
         ImportError: DIPY or nibabel is missing.
@@ -143,7 +143,7 @@ def fit_dwi(
         *nifti.placement_notes(image),
     ]
     if bvec_frame != "fsl":
-        notes.append(f"directions read along the {bvec_frame} axes, as asked; tensors transformed to the voxel axes")
+        notes.append(f"gradient directions read along the {bvec_frame} axes; tensors transformed to the voxel axes")
     if noise is not None:
         left = f"the fit's residuals, with {int(used.sum()) - 7} degrees of freedom in each voxel"
         known = left if noise == "residuals" else f"the stated noise of the images, {noise:g}"
@@ -154,13 +154,16 @@ def fit_dwi(
     return replace(volume, notes=tuple(notes), digest=digest(name))
 
 
-# Let y be the log signals, X the design matrix, β the unknowns, W the diagonal matrix of signals w that an unweighted
-# fit predicts, and σ² the variance of the noise. Weighted least squares minimise ‖W(y − Xβ)‖². To first order, a log
-# signal has the variance σ²/w², so β has the covariance σ²(XᵀW²X)⁻¹. The estimate of σ² is the sum of squared residuals
-# of the signals, divided by the number of images minus the number of unknowns (Koay, Chang, Pierpaoli and Basser 2007).
-# The residual rₙ of image n changes β by (XᵀW²X)⁻¹ Xₙ wₙ rₙ, where Xₙ is row n of X. This residual has the variance
-# σ²(1 − h) with h = wₙ² Xₙᵀ(XᵀW²X)⁻¹Xₙ, so rₙ/√(1 − h) has the variance of the noise (MacKinnon and White 1985, HC2).
-# A sample of the noise has one random factor for each image, which preserves correlations between voxels.
+# In a voxel, let y be the log signals, X the design matrix, β the vector of unknowns, and W the diagonal matrix of the
+# signals that an unweighted fit predicts. Weighted least squares minimise ‖W(y − Xβ)‖². If the noise has the variance
+# σ², a log signal has the variance σ²/w² to first order, where w is the predicted signal. The estimate of the unknowns
+# therefore has the covariance σ²(XᵀW²X)⁻¹, with the design matrix X and the predicted signals W. The estimate of σ² is
+# the sum of squared residuals of the signals, divided by the number of images minus the number of unknowns (Koay,
+# Chang, Pierpaoli and Basser 2007). The signal residual r of an image changes the unknowns by (XᵀW²X)⁻¹xwr, where x is
+# the image's row of the design matrix X, and w is its predicted signal. The residual r has the variance σ²(1 − h),
+# where h = w²xᵀ(XᵀW²X)⁻¹x is the leverage of the image. So the scaled residual r/√(1 − h) has the variance σ² of the
+# noise (MacKinnon and White 1985, HC2). A sample of the noise has one random factor for each image, which preserves
+# correlations between voxels.
 def _covariance(
     signal: Float[np.ndarray, "nx ny nz n"],
     inside: Bool[np.ndarray, "nx ny nz"],
@@ -204,7 +207,7 @@ def _covariance(
     covariance[inside] = turned @ (variance[:, None, None] * inverse[:, :6, :6]) @ turned.T
     if noise != "residuals":
         return covariance, None
-    # The fit reproduces some images exactly, such as a single unweighted image. A random ±σ replaces their residuals.
+    # The noise's standard deviation with a random sign replaces residuals of images that the fit reproduces exactly.
     unseen = np.random.default_rng(0).choice([-1.0, 1.0], data.shape) * np.sqrt(variance)[:, None]
     modes = np.zeros((*inside.shape, len(design), 6), np.float32)
     for i, x in enumerate(design):  # a loop saves memory

@@ -39,39 +39,39 @@ def read_tensors(
     """Read a field of diffusion tensors.
 
     The suffix of the file determines the format. If neither the file nor an argument gives the order of the components
-    or their axes, the function raises an error that lists the choices. Lengths are in mm if the file declares their
-    unit, and a note reports any conversion.
+    or their axes, the function raises an error that lists the choices. If the file declares its unit of length, lengths
+    are converted to mm, and a note reports the conversion.
 
     - NIfTI: an image (nx, ny, nz, 1, 6) or (nx, ny, nz, 6). The symmetric-matrix intent (code 1005) or a BIDS sidecar
       declares the order, and the sidecar may declare the frame. The tensors may also be in six images of one component
       each; pass the path of one image, or the paths of all six.
     - MRtrix: an image (nx, ny, nz, 6), as dwi2tensor writes it.
-    - NRRD: any axis may hold the components. The kind of this axis is one of NRRD's 2D or 3D matrices; otherwise, the
-      axis has six components (three in the plane), and `order` is needed. The measurement frame is applied. If the
+    - NRRD: an image with tensor components along any axis. The axis of the components has one of NRRD's 2D or 3D matrix
+      kinds, or six entries (three for 2×2 tensors) in the given `order`. The measurement frame is applied. If the
       file's space is patient-based, the affine's axes are right, anterior, superior.
     - VTK (``.vti``, structured points in ``.vtk``): tensors of nine or six components at points or cells, and an
       optional array ``mask``. An image one voxel thick gives 2×2 tensors if the components across its plane are zero.
     - npz: the array ``tensors`` (nx, ny, 2, 2) or (nx, ny, nz, 3, 3), where array axis a runs along coordinate a. If
-      `order` is given, the last axis may have six components (three in the plane). Optional arrays are ``spacing``
-      (d,) = 1, ``origin`` (d,) = 0, ``mask`` (*shape,), ``affine`` (4, 4), ``slice_axis``, ``order`` and ``frame``. An
-      npy file has only the tensors.
+      `order` is given, ``tensors`` may also have the shape (nx, ny, 3) or (nx, ny, nz, 6). An npz may also contain
+      ``spacing`` (d,), which is 1 by default, ``origin`` (d,), which is 0 by default, ``mask`` (*shape,), ``affine``
+      (4, 4), ``slice_axis``, ``order`` and ``frame``. An npy file has only the tensors.
 
     Args:
-        path: the file, or six files.
+        path: the path of the file, or the paths of six images of one component each.
         order: ``"nifti"`` (xx xy yy xz yz zz), ``"fsl"`` (xx xy xz yy yz zz), ``"mrtrix"`` (xx yy zz xy xz yz) or
             ``"vtk"`` (xx yy zz xy yz xz). None uses the declared order. Omit `order` for whole matrices.
-        mask: a file (see `read_mask`) or a bool array of the volume's shape. None uses the file's mask, if any.
+        mask: a file (see `read_mask`) or a bool array of the volume's shape. None uses the tensor file's mask, if any.
         frame: the axes of the file's components: ``"voxel"``; ``"fsl"`` (voxel axes, where the first is reversed if the
             affine's determinant is positive); ``"world"`` (the axes of the file's space); ``"measurement"`` (NRRD's
             frame). None uses the declared axes, or else the convention of the order: voxel axes for ``"nifti"``, FSL's
             for ``"fsl"``, and ``"world"`` for ``"mrtrix"`` and ``"vtk"``. NumPy's files use voxel axes.
         array: the name of the tensors' array in an npz or VTK file with several arrays.
-        spacing: the spacing for NumPy's files that do not contain it.
-        confidence: the threshold for NRRD's masked kinds. A voxel with a larger confidence is inside the mask.
-        repair: the repair of tensors inside the mask that are not positive definite; see `repair_tensors`. If None, the
-            tensors stay unchanged, but no metric can be made from them.
-        unit: the unit of the tensors, ``"mm2/s"``, ``"um2/ms"`` (10⁻³ mm²/s), ``"um2/s"``, ``"cm2/s"`` or ``"m2/s"``.
-            The tensors are converted from this unit to mm²/s; None leaves the numbers unchanged.
+        spacing: the distance between voxels, for NumPy's files without ``spacing``.
+        confidence: for NRRD's masked kinds, the confidence above which a voxel is inside the mask.
+        repair: the repair of tensors inside the mask that are not positive definite; see `repair_tensors`. None leaves
+            all tensors unchanged, but `hks_jax.TensorField` requires positive definite tensors.
+        unit: the unit of the tensors in the file, ``"mm2/s"``, ``"um2/ms"`` (10⁻³ mm²/s), ``"um2/s"``, ``"cm2/s"`` or
+            ``"m2/s"``, which is converted to mm²/s. If `unit` is None, the numbers stay unchanged.
 
     Returns:
         The tensors along the voxel axes; `questions` reports a frame or a unit that looks wrong.
@@ -127,9 +127,9 @@ def save(
       NAME.json beside the image as ``Times``, following BIDS.
     - ``.nrrd``: the same image with times along the last axis, and `extra` as text in the header.
     - ``.vti``: point data with ``mask`` and one array per time, whose name contains the time; field data with `extra`.
-    - ``.npz``: the values as the array `name`, and the arrays in `extra`. A grid adds ``spacing``, ``origin``, and if
-      they exist ``mask``, ``affine`` and ``slice_axis``. A mesh adds ``vertices`` and ``faces`` (triangles) or
-      ``cells`` (tetrahedra).
+    - ``.npz``: the values as the array `name`, and the arrays in `extra`. For a volume or slice, the npz also contains
+      ``spacing`` and ``origin``, and ``mask``, ``affine`` and ``slice_axis`` unless they are None. For a mesh, the npz
+      also contains ``vertices``, and ``faces`` (triangles) or ``cells`` (tetrahedra).
     - ``.vtu``, ``.vtk``, ``.msh`` (Gmsh), and for triangles ``.ply``: the mesh and one array per time.
 
     Every file contains a JSON record of its origin: the version, the tensors' file with its SHA-256, order and frame,

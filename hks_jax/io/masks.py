@@ -11,7 +11,6 @@ from scipy import ndimage
 
 from hks_jax.domain.components import as_mask
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
-from hks_jax.io import nifti
 from hks_jax.io.formats import IMAGES, format_of
 from hks_jax.io.tables import read_table
 from hks_jax.io.volume import TensorVolume, corners
@@ -23,11 +22,11 @@ def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) ->
 
     Args:
         path: the file.
-        affine: the affine of the image that the mask belongs to. A mask at another position raises an error.
+        affine: the affine of the image to which the mask belongs, for a comparison with the mask's affine.
 
     Raises:
         FileNotFoundError: the file does not exist.
-        ValueError: the kind of file is unknown, a value is not 0 or 1, or the mask has another position.
+        ValueError: the kind of file is unknown, a value is not 0 or 1, or the mask is displaced from the image.
         ImportError: nibabel (for NIfTI) or pynrrd (for NRRD) is missing.
 
     Examples:
@@ -81,14 +80,15 @@ def erode(mask: Bool[np.ndarray, "*shape"], iterations: int = 1) -> Bool[np.ndar
 
 
 def read_labels(path: str | os.PathLike[str], on: TensorVolume | SimplicialMesh) -> Integer[np.ndarray, "*shape"]:
-    """Read integer labels at the voxels of an image or the vertices of a mesh from NIfTI or ``.npy`` (0: unlabelled).
+    """Read integer labels at the voxels of an image or the vertices of a mesh; 0 means unlabelled.
 
-    If the labels and the image have affines, their voxels must coincide. For a slice, the file may have the labels of
-    the whole volume, or of the slice in two dimensions. Otherwise, the labels must have the shape of the image.
+    The formats are NIfTI, MRtrix, NRRD and ``.npy``. If labels and image have affines, each voxel of the image must
+    coincide with a voxel of the labels, and labels for a slice may cover the whole volume, or the slice in 2D. If
+    labels or image have no affine, they must have the same shape. A mesh needs one label per vertex.
     """
     shape, affine = (on.shape, on.affine) if isinstance(on, TensorVolume) else ((len(on.vertices),), None)
     name = os.fspath(path)
-    values, place = _image(name, affine, (*nifti.SUFFIXES, ".npy"))
+    values, place = _image(name, affine, tuple(suffix for suffix in IMAGES if suffix != ".npz"))
     if isinstance(on, TensorVolume) and affine is not None and place is not None and values.ndim in (2, 3):
         if values.ndim == 2:  # the file's two axes are the axes of the slice
             values = np.expand_dims(values, on.thin_axis)
@@ -128,11 +128,11 @@ def names_beside(path: str | os.PathLike[str]) -> str | None:
 
 
 def _image(name: str, affine: np.ndarray | None, suffixes: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return a file's values without trailing axes of length one, and its affine or None; `affine` is the image's."""
+    """Return the values of a mask or label map without trailing axes of length one, and its affine or None."""
     read = format_of(name, suffixes).read_image
     assert read is not None
     values, place, unit = read(name)
-    if place is not None and affine is not None and not unit:  # some programs lose the unit, which is mm, m or µm
+    if place is not None and affine is not None and not unit:  # guess a lost unit (mm, m or µm) by the image's affine
         ratio = np.linalg.norm(affine[:3, :3]) / np.linalg.norm(place[:3, :3])
         scale = min((1.0, 1e3, 1e-3), key=lambda s: abs(math.log(ratio / s)))
         place = np.diag([scale, scale, scale, 1.0]) @ place

@@ -48,10 +48,10 @@ def read_mesh(path: str | os.PathLike[str], *, clean: bool = False, in_space: bo
         clean: whether to clean the mesh. Cleaning removes vertices that are not finite and their cells, merges vertices
             within 1e-8 of the mesh's size, flips the longest edge of triangles of nearly zero height, removes cells of
             zero area or volume, duplicate cells and unused vertices, and reverses tetrahedra of negative orientation.
-            The remaining vertices are renumbered in the order of the file, and a warning lists the changes.
+            The kept vertices are renumbered in the order of the file. A warning lists what cleaning changed.
         in_space: whether to return the scanner coordinates that images have. FreeSurfer's coordinates are transformed
-            by the axes and the centre (c_ras) of its volume, and GIFTI's coordinates by the transformation in the file.
-            Coordinates in other formats stay unchanged.
+            by the axes and the centre (c_ras) of their volume, GIFTI's coordinates by the transformation in the file.
+            Coordinates in all formats except FreeSurfer's and GIFTI stay unchanged.
 
     Raises:
         FileNotFoundError: the file does not exist.
@@ -85,7 +85,7 @@ def read_mesh_arrays(
 ) -> dict[str, Float[np.ndarray, "V *components"]]:
     """Read the named arrays at the vertices of a mesh, such as tensors or the signatures that `save` writes.
 
-    The formats ``.vtk``, ``.vtu``, ``.vtp``, ``.msh`` and ``.ply`` have such arrays; for others the result is empty.
+    Only ``.vtk``, ``.vtu``, ``.vtp``, ``.msh`` and ``.ply`` have arrays at vertices; other files give an empty result.
 
     Args:
         path: the file.
@@ -133,7 +133,6 @@ def write(path: Path, arrays: Mapping[str, Float[np.ndarray, " V"]], mesh: Simpl
 
 
 def _load(path: str | os.PathLike[str], clean: bool, in_space: bool = False) -> tuple[Loaded, str]:
-    """Return the mesh in a file, cleaned if `clean`, and a text that lists the changes."""
     file = existing(path)
     name = file.name.lower()
     if name.endswith((".gii", ".gii.gz")):
@@ -160,7 +159,7 @@ def _same_places(vertices: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, " V"]:
     if not finite.size:
         return first
     points = vertices[finite]
-    # Exact duplicates are merged first, because their number of pairs grows with the square of their multiplicity.
+    # Equal vertices are merged before the search for close pairs, because n equal vertices form n(n − 1)/2 pairs.
     _, copy, place = np.unique(points + 0.0, axis=0, return_index=True, return_inverse=True)
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
     pairs = cKDTree(points[copy]).query_pairs(_NEAR * size, output_type="ndarray")
@@ -172,7 +171,7 @@ def _same_places(vertices: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, " V"]:
 
 
 def _require_joined(loaded: Loaded) -> str:
-    """Return a warning if vertices coincide, otherwise the empty text; raise ValueError if pieces touch there."""
+    """Return a warning if vertices coincide, or ""; raise ValueError if merging them joins pieces of the mesh."""
     first = _same_places(loaded.vertices)
     doubled = int((first != np.arange(len(first))).sum())
     if not doubled:

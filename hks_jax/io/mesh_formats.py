@@ -27,7 +27,7 @@ def through_meshio(path: Path) -> Loaded:
     """Load triangles or tetrahedra through meshio; raise ValueError for other cells and damaged files."""
     suffix = path.suffix.lower()
     library = optional("meshio")
-    # For STL in text form, meshio first reads letters as a number of triangles, which overflows.
+    # meshio computes the length of a binary STL file from its number of triangles, which overflows for STL text.
     with reading(path, f"a mesh that meshio can read as {suffix}"), np.errstate(over="ignore"):
         content = path.read_bytes()
         declared = _declared(content, suffix)
@@ -63,7 +63,7 @@ _COUNTS = {
 """Patterns of the declared numbers of points and cells in each format. For .stl, meshio checks the file's length."""
 
 _PLY = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
-"""The size in bytes of each type in .ply that has another name in NumPy."""
+"""The size in bytes of each PLY type that has a C name. PLY's other types, such as int32, have NumPy's names."""
 
 
 def _declared(content: bytes, suffix: str) -> tuple[int, ...]:
@@ -85,7 +85,7 @@ def _compare(content: bytes, suffix: str, declared: tuple[int, ...], mesh: Any) 
         raise ValueError(what.format(*declared[:2], *counts))
     corners = sum(block.data.size for block in mesh.cells)
     lists = re.search(rb"\bCELLS\s+(\d+)\s+(\d+)", content) if suffix == ".vtk" else None
-    if lists is not None:  # before version 5, the declared number also counts one entry per cell
+    if lists is not None:  # before VTK's file version 5, the length of CELLS also counts one entry per cell
         listed = int(lists[2]) - (0 if re.match(rb"# vtk DataFile Version [5-9]", content) else counts[1])
         if listed != corners:  # if a cell's type is wrong, meshio omits corners
             raise ValueError(f"the file lists {listed} corners, but cells of the declared types have {corners}")
@@ -99,7 +99,7 @@ def _compare_ply(content: bytes, mesh: Any) -> None:
     of_points, _, of_cells = head.partition(b"element face")
     lists = re.findall(rb"property\s+list\s+(\w+)\s+(\w+)", of_cells)
     if len(lists) != 1:
-        return  # with other lists, the length of the cells is unknown
+        return  # the length of the faces' data is known only if each face has one list, of its corners
 
     def size(name: bytes) -> int:
         return 1 if ascii_ else _PLY.get(name.decode()) or np.dtype(name.decode()).itemsize
@@ -114,7 +114,7 @@ def _compare_ply(content: bytes, mesh: Any) -> None:
 
 
 def _declared_by_gmsh(content: bytes) -> tuple[int, int, int]:
-    """Return the numbers of nodes and elements, and the largest node tag, which is the length of a table in meshio."""
+    """Return the declared numbers of nodes and elements, and the largest node tag, the length of an array in meshio."""
     head = _GMSH.match(content)
     if head is None or head[1] not in (b"2", b"2.2", b"4", b"4.1"):
         version = "no Gmsh format" if head is None else f"Gmsh format {head[1].decode(errors='replace')}"
@@ -175,7 +175,7 @@ def fans(
     """Cut each polygon into triangles that share its first corner from which all other corners are visible.
 
     Raises:
-        ValueError: a vertex does not exist, or a polygon, whose number is in `numbers`, has no such corner.
+        ValueError: a polygon has a vertex that does not exist, or no corner from which all other corners are visible.
     """
     if polygons.ndim != 2 or polygons.shape[1] < 3:
         raise ValueError(f"{file}: got faces of shape {polygons.shape}; expected at least 3 corners each")
@@ -250,14 +250,13 @@ def load_off(file: Path) -> Loaded:
         vertices = [[float(word) for word in row[:3]] for row in rows[:n_vertices]]
         polygons = [[int(word) for word in row[1 : 1 + int(row[0])]] for row in rows[n_vertices:]]
         for row, corners in zip(rows[n_vertices:], polygons, strict=True):
-            # A colour may follow the corners, as an index or as three or four numbers.
+            # In the line of a face, a colour may follow the corners: an index, or three or four numbers.
             if len(corners) != int(row[0]) or len(corners) < 3 or len(row) - 1 - len(corners) > 4:
                 raise ValueError(f"got the face {' '.join(row)[:60]}; expected n, n corners, an optional colour")
     return _triangulated(file, vertices, polygons)
 
 
 def _triangulated(file: Path, vertices: list[list[float]], polygons: list[list[int]]) -> Loaded:
-    """Return the mesh with polygons cut into triangles, in the order of the file."""
     if not polygons:
         raise ValueError(f"{file}: the mesh has no triangles; expected at least one face")
     points, order, triangles = np.array(vertices, np.float64).reshape(-1, 3), [], []

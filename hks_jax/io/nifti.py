@@ -75,7 +75,6 @@ def affine_in_mm(name: str, image: Any) -> tuple[np.ndarray, str]:
 
 
 def _read_image(name: str) -> tuple[np.ndarray, np.ndarray, str]:
-    """Return voxel values, the affine in mm, and the unit of length that the file declares."""
     image = load(name)
     return voxels(name, image), *affine_in_mm(name, image)
 
@@ -161,7 +160,8 @@ def component_of(path: str | os.PathLike[str]) -> str | None:
 def siblings(path: str | os.PathLike[str]) -> list[str]:
     """Return the paths of all six images of components if `path` is one of them, or else only `path`.
 
-    Such an image is in NIfTI and has one value per voxel. The six names differ only in the component.
+    Images of one component are NIfTI images with one value per voxel. The names of the six images, such as
+    ``dtxx.nii`` and ``dtxy.nii``, differ only in the component.
     """
     name = os.fspath(path)
     if component_of(name) is None or not is_nifti(name) or math.prod(load(name).shape[3:]) != 1:
@@ -199,7 +199,7 @@ def read_components(paths: Sequence[str], order: str | None, frame: str | None) 
     for name, image in zip(names, images, strict=True):
         if image.shape != first.shape or math.prod(image.shape[3:]) != 1:
             raise ValueError(
-                f"{files[name]}: got shape {image.shape}; expected one component and one shape in all six files"
+                f"{files[name]}: got shape {image.shape}; expected six images of equal shape with one value per voxel"
             )
         if not np.allclose(affine_in_mm(files[name], image)[0], affine, rtol=1e-4, atol=1e-3):
             raise ValueError(f"{files[name]}: its affine differs from that of {files['xx']}; expected equal affines")
@@ -231,7 +231,7 @@ def placement_notes(image: Any) -> list[str]:
 def _write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
     others = sorted(extra.keys() - {"times"})
     if others:
-        raise ValueError(f"extra: got {', '.join(others)}, but NIfTI allows only times. Write an .npz as well")
+        raise ValueError(f"extra: got {', '.join(others)}; expected only times for NIfTI. Write an .npz as well")
     if "times" in extra:
         sources = [Path(volume.source).name] if volume.source else []
         about = {"Quantity": name, "Times": np.ravel(extra["times"]).tolist(), "Sources": sources}

@@ -53,9 +53,9 @@ class Placement(NamedTuple):
     Attributes:
         directions: column a is the step along voxel axis a, in the file's space.
         origin: the position of voxel 0, in the file's space.
-        signs: the signs that transform the file's space to right, anterior, superior; None if it is not patient-based.
+        signs: the signs that transform a patient-based space to right, anterior, superior; None for other spaces.
         measured: the vectors of the measurement frame as columns, or None.
-        placed: whether the file gives directions, and not only spacings.
+        placed: whether the file gives the directions of the voxel axes, and not only the spacings.
         unit: the file's unit of length; empty if there is none.
     """
 
@@ -97,7 +97,7 @@ def load(name: str) -> tuple[np.ndarray, dict[str, Any]]:
 def _check_header(text: bytes, header: Mapping[str, Any]) -> None:
     """Raise ValueError for a header line that is neither a field nor a key, and for a field of wrong length.
 
-    Without this check, a field with a damaged name would be ignored and have its default, such as a spacing of 1.
+    Without an error, a field with a damaged name would have its default, such as a spacing of 1.
     """
     fields = _FIELDS.split(", ")
     for line in text.splitlines()[1:]:
@@ -138,7 +138,6 @@ def _check_data(file: Path, header: Mapping[str, Any], start: int) -> None:
 
 
 def _read_image(name: str) -> tuple[np.ndarray, Float[np.ndarray, "4 4"] | None, str]:
-    """Return voxel values, the affine or None, and the unit of length that the file declares."""
     data, header = load(name)
     place = _placement(name, header, list(range(data.ndim)))
     return data, place.affine, place.unit
@@ -167,7 +166,7 @@ def _read_tensors(name: str, order: str | None, frame: str | None, confidence: f
     if affine is not None and place.signs is None:
         notes.append(f"the affine's axes are the axes of the file's space, {header.get('space', 'unnamed')!r}")
     elif affine is None and d == 2 and not np.allclose(place.directions, np.diag(spacing)):
-        notes.append("the grid's axes are the voxel axes; the directions of these axes in the plane are ignored")
+        notes.append("the coordinate axes are the axes of the 2D image; directions of its axes in the file are ignored")
     if place.unit not in ("", "mm"):
         notes.append(f"lengths converted from {place.unit}, which the file declares, to mm")
     notes.append(found._replace(of=f" ({label or 'as asked'})").note(frame))
@@ -206,10 +205,10 @@ def _write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, An
 
 
 def _store(path: Path, array: np.ndarray, volume: TensorVolume, record: str, kind: str, more: dict[str, Any]) -> None:
-    """Write an array over the voxels of a volume; if it has an affine, the space is right, anterior, superior.
+    """Write an array over the voxels of a volume, in the space right-anterior-superior if the volume has an affine.
 
-    If `kind` is not empty, the first axis of the array has tensor components of this kind; otherwise, the last axis may
-    have times. A slice with an affine must be one voxel thick. The header receives the arrays in `more` as text.
+    If `kind` is not empty, the first axis of the array has tensor components of this NRRD kind; otherwise, the last
+    axis may have times. A slice with an affine must be one voxel thick. The header has the arrays in `more` as text.
     """
     nrrd = optional("nrrd")
     placed = volume.affine is not None and not kind.startswith("2D")

@@ -48,8 +48,8 @@ def save_pairs(path: str | os.PathLike[str], pairs: Eigenpairs, extra: Mapping[s
 def load_pairs(path: str | os.PathLike[str], pencil: AnyPencil) -> Eigenpairs:
     """Read eigenpairs that `save_pairs` wrote, for the same pencil.
 
-    Signatures of the loaded pairs equal signatures of the saved pairs. Derivatives with respect to the tensors are not
-    available, because they need the computation of the pairs, which is not repeated.
+    Signatures of the loaded eigenpairs equal signatures of the saved eigenpairs. Signatures of loaded eigenpairs have
+    no derivatives with respect to the tensors, because the eigenproblem is not solved again.
 
     Args:
         path: the file.

@@ -14,14 +14,15 @@ from hks_jax.io.volume import AXES, TensorVolume
 ANISOTROPIC = 0.3
 """The fractional anisotropy above which a tensor's principal direction counts as the direction of a fibre."""
 _ENOUGH = 1000
-"""Frames are compared if at least this number of voxels have both neighbours along their direction."""
+"""The number of voxels with two anisotropic neighbours along the fibre that a comparison of frames needs."""
 _BLOCK, _BLOCKS = 8, 8
-"""The size of blocks, in voxels per axis, and their least number. The standard error of a mean comes from the scatter
-between blocks, because neighbouring voxels are correlated."""
+"""The size of cubic blocks of voxels, in voxels per axis, and the least number of blocks. The standard error of a mean
+angle comes from the scatter between blocks of voxels, because neighbouring voxels are correlated."""
 CLEAR = 3.5
-"""The number of standard errors above which the difference between two mean angles is significant."""
+"""The number of standard errors above which the difference between the mean angles in two frames is significant."""
 _SMOOTH = 3.0
-"""The mean angle, in degrees, below which differences between frames come from the discrete steps between voxels."""
+"""The mean angle between fibres of neighbouring voxels, in degrees, below which frames are not distinguished, because
+each fibre's direction is rounded to a step between voxels."""
 
 _SAID = "Principal directions differ from the mean direction of their two neighbours along the fibre by"
 
@@ -29,7 +30,7 @@ _SAID = "Principal directions differ from the mean direction of their two neighb
 class Alternative(NamedTuple):
     """Alternative axes for the components of a file."""
 
-    name: str  # a frame, or the reversed axis, which belongs to the voxels or to the scanner
+    name: str  # a frame, or the reversed axis, such as "x" (a voxel axis) or "scanner's x"
     is_frame: bool  # whether `name` is a frame
     angle: float  # the mean angle, in degrees, between a principal direction and the mean direction of its neighbours
     errors: float  # the decrease of `angle` relative to the axes in which the file was read, in standard errors
@@ -46,7 +47,7 @@ class Coherence(NamedTuple):
     def better(self) -> Alternative | None:
         """The alternative axes with the best alignment of fibres, if it is clearly better than in the file's frame.
 
-        A frame is preferred to a reversed axis of almost equal gain, because the two may differ by a small rotation.
+        A frame is preferred to a reversed axis of almost equal mean angle, because both may give almost the same axes.
         """
         clear = [a for a in self.others if a.errors > CLEAR and self.angle > _SMOOTH]
         best = min(clear, key=lambda a: a.angle, default=None)
@@ -55,16 +56,16 @@ class Coherence(NamedTuple):
 
     @property
     def worse(self) -> tuple[Alternative, ...]:
-        """The alternative axes along which fibres line up clearly worse than in the frame of the file."""
+        """The alternative axes for which fibres line up worse than in the file's frame by over 3.5 standard errors."""
         return tuple(a for a in self.others if a.errors < -CLEAR)
 
     @property
     def note(self) -> str:
-        """A sentence that compares the alignment of fibres with clearly worse axes; empty if there are none."""
+        """A note that the file's frame seems right, with the axes that are clearly worse; empty if none are worse."""
         worse = [f"along the {a.name} axes" for a in self.worse if a.is_frame]
         if flips := [a.name for a in self.worse if not a.is_frame]:
             worse.append(f"with {', '.join(flips)} reversed")
-        said = f"The axes of the tensors seem right. {_SAID} {self.angle:.1f}° on average, and clearly more"
+        said = f"The axes of the tensors seem right. {_SAID} {self.angle:.1f}° on average; the angle is clearly larger"
         return f"{said} {', or '.join(worse)}" if worse else ""
 
     def question(self, option: str) -> str:
@@ -83,9 +84,10 @@ class Coherence(NamedTuple):
 def coherence(volume: TensorVolume) -> Coherence | None:
     """Measure how well fibres of neighbouring voxels line up, in the frame of the file and along alternative axes.
 
-    The principal direction v at an anisotropic voxel is compared with the mean direction at its two neighbours along
-    ±v, if both are anisotropic. The angle between v and this mean is least in the correct frame. Alternative axes are
-    the frames of `read_tensors` and reversed axes. The result is None for a slice, or for fewer than 1000 such angles.
+    The principal direction at an anisotropic voxel is compared with the mean principal direction at the two neighbours
+    along the fibre, if both are anisotropic. The mean angle between principal directions and mean directions is least
+    in the correct frame. Alternative axes are the frames of `read_tensors` and reversed axes. The result is None for a
+    slice, or if fewer than 1000 voxels have two anisotropic neighbours along the fibre.
     """
     if volume.dimension != 3:
         return None
@@ -104,7 +106,7 @@ def coherence(volume: TensorVolume) -> Coherence | None:
         angles = _angles(voxels, directions @ turn.T.astype(directions.dtype), index, spacing)
         both = np.isfinite(own) & np.isfinite(angles)
         gain = (own - angles)[both]
-        # If all fibres are straight along both sets of axes, all angles are zero, and so is the gain.
+        # If fibres are straight in the file's frame and along the alternative axes, all angles and gains are zero.
         if len(gain) < _ENOUGH or len(np.unique(block[both])) < _BLOCKS or not gain.any():
             continue
         scatter = math.sqrt(float((np.bincount(block[both], gain - gain.mean()) ** 2).sum()))
@@ -114,7 +116,6 @@ def coherence(volume: TensorVolume) -> Coherence | None:
 
 
 def _fibres(volume: TensorVolume) -> tuple[Int[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Return the anisotropic voxels inside the mask, and their principal directions."""
     traces = np.trace(volume.tensors, axis1=-2, axis2=-1)  # zero in the background
     usable: Bool[np.ndarray, "*shape"] = volume.inside & np.isfinite(volume.tensors).all(axis=(-2, -1)) & (traces > 0)
     tensors = volume.tensors[usable].astype(np.float64)
@@ -132,8 +133,8 @@ def _angles(
 ) -> Float[np.ndarray, " n"]:
     """Return the angle, in degrees, between each direction and the mean direction of its two neighbours, or NaN.
 
-    Along a curved fibre, the directions at the two neighbours deviate to opposite sides, and the deviations cancel in
-    the mean. With a single neighbour, circular fibres around a heart would seem to line up best along radii.
+    Along a curved fibre, the directions at a voxel's two neighbours deviate to opposite sides, and the mean of the two
+    directions has no deviation. With only one neighbour, circular fibres around a heart would seem to be radial.
     """
     steps = directions / spacing
     steps = np.rint(steps / np.abs(steps).max(axis=1, keepdims=True)).astype(int)
@@ -177,8 +178,8 @@ def questions(volume: TensorVolume) -> tuple[str, ...]:
     """Check tensors for a wrong frame or unit; return questions such as "Wrong unit?", each with a remedy.
 
     Reflected or rotated tensors are still positive definite, but fibres of neighbouring voxels do not line up. The
-    function therefore computes the mean angle between the principal directions at a voxel and at its neighbours along
-    the fibre, and compares the angles for several frames. It needs about 1000 anisotropic voxels; set the mask first.
+    function therefore compares, for several frames, the mean angle between the principal directions at a voxel and at
+    its neighbours along the fibre. The comparison needs about 1000 anisotropic voxels inside the mask; set it first.
 
     If lengths are in mm, the function also checks that the size of the voxels is usual for scans, and that the median
     mean diffusivity occurs in living tissue. For a slice, only the units are checked.
@@ -192,7 +193,7 @@ def questions(volume: TensorVolume) -> tuple[str, ...]:
 
 
 def reviewed(volume: TensorVolume) -> tuple[TensorVolume, tuple[str, ...]]:
-    """Return the volume, with a note about its fibres in place of the note `OPEN_FRAME`, and its `questions`."""
+    """Return the volume, with a note about its fibres but without the note `OPEN_FRAME`, and its `questions`."""
     found = coherence(volume) if volume.length_unit == "mm" else None
     notes = [note for note in volume.notes if note != OPEN_FRAME]
     wrong_frame, settled = "", False

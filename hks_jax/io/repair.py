@@ -33,7 +33,7 @@ REPAIRS: dict[str, str] = {
 """The methods of repair, with descriptions for messages."""
 
 _SAME, _TINY, _FILLED = 1e-6, 1e-6, 0.2
-"""The relative tolerances for equal tensors and for zero tensors, and the least share of voxels in the background."""
+"""The relative tolerances for equal tensors and for zero tensors, and the share of voxels that a background exceeds."""
 
 
 def find_invalid(volume: TensorVolume, floor: float | None = None) -> Bool[np.ndarray, "*shape"]:
@@ -77,17 +77,17 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
     Args:
         volume: the tensors. If there is no mask, voxels whose tensor is exactly zero are left out first, because many
             programs write the background as zero.
-        method: the treatment of tensors that are not positive definite or have an eigenvalue below `floor`. ``"clip"``
-            raises their eigenvalues to the floor, which gives the nearest admissible tensor in the Frobenius norm.
-            ``"mask"`` removes their voxels from the mask. ``"nearest"`` replaces each of these tensors by the tensor
-            of the nearest valid voxel in space.
-        floor: the least admissible eigenvalue, in the tensors' unit. If None, all positive eigenvalues are admissible,
-            and ``"clip"`` uses 1 % of the median of the valid tensors' mean eigenvalues.
+        method: the repair of invalid tensors, which are not positive definite or have an eigenvalue below `floor`.
+            ``"clip"`` raises eigenvalues of an invalid tensor to the floor, which gives the nearest admissible tensor
+            in the Frobenius norm. ``"mask"`` removes the voxels of invalid tensors from the mask. ``"nearest"``
+            replaces an invalid tensor by the tensor of the nearest valid voxel in space.
+        floor: the least admissible eigenvalue, in the tensors' unit. If `floor` is None, all positive eigenvalues are
+            admissible, and the floor of ``"clip"`` is 1 % of the median of the valid tensors' mean eigenvalues.
 
     Returns:
-        The volume. Its ``repair`` contains the method, the floor, the number of repaired voxels and of all voxels, the
-        number of tensors that are not finite, the worst eigenvalue, and the bounding box and first indices of the
-        repaired voxels. A note summarises the repair.
+        The repaired volume, with a note that summarises the repair. The volume's attribute ``repair`` contains the
+        method, the floor, the number of repaired voxels and of all voxels, the number of tensors that are not finite,
+        the worst eigenvalue, and the bounding box and first indices of the repaired voxels.
 
     Raises:
         ValueError: the method is unknown, the floor is not positive, no tensor is valid, or a tensor is NaN or infinite
@@ -131,7 +131,7 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
     worst = f" (the worst eigenvalue is {report['worst_eigenvalue']:.3g})" if finite.any() else ""
     tensors, changed = volume.tensors.copy(), dict[str, Any]()
     if method == "mask":
-        changed["mask"], done = inside & ~bad, "their voxels are left out"
+        changed["mask"], done = inside & ~bad, "the repair leaves out the voxels of invalid tensors"
     elif method == "clip":
         if report["not_finite"]:
             raise ValueError(
@@ -144,12 +144,12 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
         wrong_ones = tensors[bad].astype(np.float64)
         values, vectors = np.linalg.eigh(wrong_ones + np.swapaxes(wrong_ones, -1, -2))
         raised = (vectors * np.maximum(values / 2, floor)[:, None, :]) @ np.swapaxes(vectors, -1, -2)
-        tensors[bad], done = raised, f"their eigenvalues are raised to {floor:.3g}"
+        tensors[bad], done = raised, f"the repair raises eigenvalues of invalid tensors to {floor:.3g}"
     else:
         nearest = ndimage.distance_transform_edt(
             bad | ~inside, sampling=volume.spacing, return_distances=False, return_indices=True
         )
-        source, done = tuple(index[bad] for index in nearest), "they are replaced by the nearest valid tensor"
+        source, done = tuple(index[bad] for index in nearest), "the nearest valid tensor replaces each invalid tensor"
         tensors[bad] = tensors[source]
         for name in ("covariance", "modes"):
             if (known := getattr(volume, name)) is not None:
@@ -160,15 +160,15 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
 
 
 def _why_so_many(volume: TensorVolume, finite: Float[np.ndarray, "n d d"]) -> str:
-    """Return a possible reason for many invalid tensors, such as a wrong order; `finite` has those that are finite."""
+    """Return a possible reason for many invalid tensors, such as a wrong order; `finite` has the finite ones."""
     question = "" if volume.invalid_by_order is None else volume.invalid_by_order.question
     if question or not len(finite):
-        return question or "Noise does not explain this number. Programs often write NaN outside a mask"
+        return question or "Noise does not explain so many invalid tensors. Programs often write NaN outside a mask"
     largest = np.abs(np.linalg.eigvalsh(finite.astype(np.float64))).max()
     return (
-        "Noise does not explain this number. Tensors that are naturally indefinite, such as stress S, need a map to "
-        f"positive definite ones: exp(S/s) with a scale s (|eigenvalue| ≤ {largest:.3g} for the invalid tensors), or "
-        f"S + c·I with a shift c > {-least_eigenvalue(finite):.3g}. Use positive_tensors or --positive"
+        "Noise does not explain so many invalid tensors. Tensors S that are naturally indefinite, such as stress, need "
+        f"a map to positive definite tensors: exp(S/s) with a scale s (|eigenvalue| ≤ {largest:.3g} for the invalid "
+        f"tensors), or S + c·I with a shift c > {-least_eigenvalue(finite):.3g}. Use positive_tensors or --positive"
     )
 
 
@@ -186,9 +186,8 @@ def without_background(volume: TensorVolume) -> TensorVolume:
 def find_background(volume: TensorVolume) -> tuple[Bool[np.ndarray, "*shape"], str] | None:
     """Return the voxels that a program filled as background, and a sentence about them; None if there are few.
 
-    Measured tensors are never exactly isotropic and equal to one another, and never a million times smaller than the
-    others. Programs such as ANTs write such tensors where there is no signal. The result is None for a volume with a
-    mask, and for a constant field.
+    Where there is no signal, programs such as ANTs write exactly equal isotropic tensors, or tensors a million times
+    smaller than others, unlike measured tensors. The result is None for a volume with a mask, and for a constant field.
 
     Examples:
         >>> tensors = np.array(field.tensors)
@@ -223,12 +222,12 @@ def find_background(volume: TensorVolume) -> tuple[Bool[np.ndarray, "*shape"], s
 def positive_tensors(volume: TensorVolume, how: PositiveMap, number: float) -> TensorVolume:
     """Map all tensors S inside the mask, such as stresses, to positive definite tensors, and return the volume.
 
-    ``"exp"`` computes exp(S/number), and ``"shift"`` computes S + number·I, as `hks_jax.TensorField.from_indefinite`
-    does. The mapped tensors are a metric, so continue with ``metric="tensor"``.
+    The map ``"exp"`` gives exp(S/s) with the scale s = `number`, and the map ``"shift"`` gives S + c·I with the shift
+    c = `number`; see `hks_jax.TensorField.from_indefinite`. The mapped tensors are a metric: use ``metric="tensor"``.
 
     Returns:
-        The volume. Its ``repair`` contains the map, its number, the number of tensors that were not positive definite,
-        and the number of all tensors. A note summarises the map.
+        The mapped volume, with a note that summarises the map. The volume's attribute ``repair`` contains the map, its
+        scale or shift, the number of tensors that were not positive definite, and the number of all tensors.
 
     Raises:
         ValueError: the map is unknown; a tensor is NaN, infinite or unsymmetric; the scale or shift is too small.

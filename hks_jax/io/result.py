@@ -18,6 +18,7 @@ from hks_jax.io.arrays import volume_of
 from hks_jax.io.files import save
 from hks_jax.io.units import median_mean_diffusivity
 from hks_jax.io.volume import TensorVolume
+from hks_jax.signatures.times import RESOLVED
 from hks_jax.storage import load_npz
 
 NAMES = ("hks", "curvature")
@@ -65,7 +66,7 @@ class Result:
         """Read a result from an npz that `save` or the command line wrote.
 
         Args:
-            path: the file, or the folder of a signature.
+            path: the npz, or a folder that ``hks-jax hks`` wrote.
             name: the name of the array. None means ``hks`` or, if the file has no such array, ``curvature``.
             over_times: whether the result must have an axis of times.
 
@@ -179,12 +180,19 @@ class Result:
 
     @property
     def z(self) -> Float[np.ndarray, "n_times *shape"] | None:
-        """The values minus the value of flat space (raw, flat) or their median (otherwise), in standard deviations."""
+        """The values minus their flat-space value or their median, in standard deviations of the noise, if known."""
         if "deviation" not in self.arrays:
             return None
+        # Normalisations except "raw" and "flat" have no known value in flat space, so the median at each time is used.
         flat = {"raw": 1 / self.flat_scale, "flat": 1.0}
         median = np.nanmedian(self.values, axis=tuple(range(1, self.values.ndim)), keepdims=True)
         return (self.values - flat.get(self.normalisation, median)) / self.arrays["deviation"]
+
+    @property
+    def smallest_time(self) -> float:
+        """The time below which more than 1 % of the signature lies beyond its eigenpairs; 0 if this is not known."""
+        spectral = self.eigenvalues.size and self.settings.get("method", "spectral") == "spectral"
+        return RESOLVED[self.dimension] / float(self.eigenvalues[-1]) if spectral else 0.0
 
     @property
     def flat_scale(self) -> Float[np.ndarray, "n_times ..."]:
@@ -206,8 +214,11 @@ class Result:
 
 
 def signature_file(result: Path) -> Path:
-    """Return the path of the signature in a folder that ``hks-jax hks`` wrote; return any other path unchanged."""
-    return result / "hks.npz" if result.is_dir() else result
+    """Return the path of the signature in a folder of ``hks-jax hks`` or of a study's subject, or else the path."""
+    if not result.is_dir():
+        return result
+    of_subject = [file for folder in ("", "*/") for file in result.glob(f"{folder}dwi/*_param-hks_dwimap.npz")]
+    return of_subject[0] if len(of_subject) == 1 else result / "hks.npz"
 
 
 def tuples(value: Any) -> Any:

@@ -67,6 +67,8 @@ def read_table(path: Path) -> list[dict[str, str]]:
             f"{file}: got the columns {', '.join(header) or 'none'} and {len(rows)} rows; expected a header of "
             f"different names, separated by {'commas' if separator == ',' else 'tabs'}, and at least one row"
         )
+    if len(header) == 1 and " " in header[0]:
+        raise ValueError(f"{file}: got one column named {header[0]!r}; expected columns separated by tabs")
     for number, row in enumerate(rows, 2):
         if len(row) > len(header):
             raise ValueError(f"{file}: got {len(row)} cells in row {number}; expected {len(header)}, as in the header")

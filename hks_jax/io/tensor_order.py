@@ -1,8 +1,8 @@
 """The orders in which programs store the components of a symmetric tensor, and the axes of the components.
 
-The same numbers represent different tensors in programs that differ in the order or the axes. In each order, the
-components xx, xy and yy of a 2×2 tensor have the same sequence as in a 3×3 tensor. NRRD's kinds of matrix have the
-order xx xy xz yy yz zz, along the axes of the measurement frame.
+The same six numbers represent different tensors in programs that differ in the order or the axes of the components. In
+each order, the components xx, xy and yy of a 2×2 tensor have the same sequence as in a 3×3 tensor. NRRD's kinds of
+symmetric matrix have the order xx xy xz yy yz zz, along the axes of the measurement frame.
 """
 
 import math
@@ -23,10 +23,10 @@ ORDERS: dict[str, tuple[str, ...]] = {
     "mrtrix": ("xx", "yy", "zz", "xy", "xz", "yz"),
     "vtk": ("xx", "yy", "zz", "xy", "yz", "xz"),  # VTK, ParaView
 }
-"""The sequence of components in each order."""
+"""For each named order, the sequence of a tensor's components."""
 
 FRAMES: dict[str, Frame] = {"nifti": "voxel", "fsl": "fsl", "mrtrix": "world", "vtk": "world"}
-"""The default frame of each order."""
+"""For each order of components, the default axes of the components."""
 
 
 def unpack(components: Float[np.ndarray, "*shape n"], order: str) -> Float[np.ndarray, "*shape d d"]:
@@ -85,25 +85,25 @@ def _indices(order: str, d: int) -> list[tuple[int, int]]:
 
 
 _SAMPLE = 20_000
-"""The number of tensors that are checked first; all tensors are checked only if many of these are invalid."""
+"""The number of tensors in a first sample; all tensors are checked only if many tensors in the sample are invalid."""
 
 
 class InvalidByOrder(NamedTuple):
     """The number of a file's tensors that would not be positive definite in each order of components."""
 
-    order: str  # the order in which the tensors were read
-    counts: dict[str, int]  # the number of invalid tensors for each order
+    order: str  # the order of components in which the tensors were read
+    counts: dict[str, int]  # the number of invalid tensors for each order of components
     of: int  # the number of nonzero tensors
 
     @property
     def fewer(self) -> list[str]:
-        """The orders with less than half as many invalid tensors as `order`, best first."""
+        """The orders of components with less than half as many invalid tensors as `order`, best first."""
         own = self.counts[self.order]
         return sorted((name for name in self.counts if 2 * self.counts[name] < own), key=self.counts.__getitem__)
 
     @property
     def question(self) -> str:
-        """A question whether the order is wrong, with the counts; empty if no order is clearly better."""
+        """A question whether the order of components is wrong; empty if no order has clearly fewer invalid tensors."""
         if not self.fewer:
             return ""
         others = ", ".join(f'{count} in "{name}"' for name, count in self.counts.items() if name != self.order)
@@ -114,7 +114,7 @@ class InvalidByOrder(NamedTuple):
 
 
 def invalid_by_order(components: Float[np.ndarray, "*shape n"], order: str) -> InvalidByOrder | None:
-    """Count the tensors that are not positive definite in each order; return None if few are invalid in `order`.
+    """Count the tensors that are not positive definite, by order of components; None if they are few in `order`.
 
     The counts do not depend on the axes of the components, and hardly distinguish ``"mrtrix"`` from ``"vtk"``, two
     orders that differ by an exchange of two off-diagonal components.
@@ -134,7 +134,7 @@ class Matrices(NamedTuple):
     tensors: Float[np.ndarray, "*shape d d"]
     order: str  # the order of components; "matrix" for whole matrices
     invalid: InvalidByOrder | None
-    of: str = ""  # the source of the components, for notes
+    of: str = ""  # words about the source of the components, for the text of `note`
 
     def note(self, frame: str) -> str:
         """Return a note about the order and the frame in which the tensors were read."""

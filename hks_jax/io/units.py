@@ -15,7 +15,7 @@ UNITS: dict[str, float] = {"mm2/s": 1.0, "um2/ms": 1e-3, "um2/s": 1e-6, "cm2/s":
 """The units of diffusivity, each in mm²/s. The unit "um2/ms" equals 10⁻³ mm²/s and 10⁻⁹ m²/s."""
 
 MM2_PER_S = "mm²/s"
-"""The unit of diffusivity of all converted tensors, as messages print it."""
+"""The unit to which diffusivities are converted, as messages and `TensorVolume.unit` write it."""
 
 LIVING_TISSUE = (1e-4, 4e-3)
 """The range of mean diffusivities in mm²/s, from dense tissue to cerebrospinal fluid (3e-3 at 37 °C)."""
@@ -63,7 +63,7 @@ def in_mm2_per_s(volume: TensorVolume, unit: Unit) -> TensorVolume:
 
 
 def length_question(volume: TensorVolume) -> str:
-    """Return a question if lengths are in mm and no scan has voxels of this size, or else the empty text."""
+    """Return a question if lengths are in mm and a voxel size is implausible for a scan, or else the empty text."""
     low, high = _VOXELS
     if volume.length_unit != "mm" or all(low <= h <= high for h in volume.spacing):
         return ""
@@ -74,7 +74,7 @@ def length_question(volume: TensorVolume) -> str:
 
 
 def unit_question(volume: TensorVolume) -> str:
-    """Return a question if lengths are in mm and no living tissue has this mean diffusivity, or else the empty text."""
+    """Return a question if lengths are in mm and the median mean diffusivity is implausible, or else the empty text."""
     if volume.length_unit != "mm":
         return ""
     median = median_mean_diffusivity(volume)
@@ -104,9 +104,8 @@ def b_value_question(largest: float) -> str:
     for name, scale in UNITS.items():
         if low <= largest / scale <= high:
             return (
-                f"the largest b-value is {largest:g}; expected {low:g} to {high:g} s/mm². If the unit of b-values is "
-                f"the reciprocal of {name}, the largest is {largest / scale:g} s/mm². Then pass unit "
-                f'"{name}", the unit of the tensors'
+                f"the largest b-value is {largest:g}; expected {low:g} to {high:g} s/mm². If the b-values are in "
+                f'1/({name}), the largest is {largest / scale:g} s/mm²: pass unit "{name}"'
             )
     return ""
 

@@ -34,7 +34,7 @@ class Format:
     # Writes results; called with a path, an array, the volume, the array's name, more arrays and the provenance.
     write: Callable[[Path, np.ndarray, "TensorVolume", str, dict[str, Any], str], None] | None = None
     write_tensors: Callable[[Path, "TensorVolume", Mapping[str, Any] | None], None] | None = None
-    image: str = ""  # the suffix of images of results, if tensors have this format; empty if results are only npz
+    image: str = ""  # the suffix of result images for tensors in this format; empty if results are saved only as npz
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,11 +59,11 @@ class TensorVolume:
             if nearly all are positive definite in `order`.
         length_unit: ``"mm"`` if the file's unit of length is known, so that lengths are in mm; otherwise empty.
         unit: ``"mm²/s"`` if the tensors' unit is known (from an argument, a fit or the file); otherwise empty.
-        covariance: (*shape, m, m), the covariance of the components xx xy yy (xz yz zz) along the voxel axes, in the
+        covariance: (*shape, m, m), the covariance of the m components xx xy yy (xz yz zz) along the voxel axes, in the
             squared unit of the tensors, if known (`fit_dwi`); otherwise None.
-        modes: (*shape, n, m), the contribution of each of the n images to the noise of these components, if the noise
-            was estimated from residuals (`fit_dwi`, in float32); otherwise None. Unlike the covariance, modes also
-            describe noise that is correlated between voxels.
+        modes: (*shape, n, m), the contribution of each of n images to the noise of the m components of a tensor, if
+            `fit_dwi` estimated the noise from residuals (in float32); otherwise None. Unlike `covariance`, `modes` also
+            describes noise that is correlated between voxels.
 
     Raises:
         ValueError: shapes disagree, a spacing is not positive, or a number is not finite.
@@ -106,8 +106,9 @@ class TensorVolume:
             per_axis(f"{where}{name}", value, d)
         if min(self.spacing) <= 0:
             raise ValueError(f"{where}spacing: got {self.spacing}; expected positive numbers")
-        if mask is not None and (mask.shape != shape or mask.dtype != bool):
-            raise ValueError(f"{where}mask: got shape {mask.shape}, {mask.dtype}; expected booleans of shape {shape}")
+        if mask is not None and not (isinstance(mask, np.ndarray) and mask.shape == shape and mask.dtype == bool):
+            got, remedy = describe_array(mask), ". `read_mask` reads a file" * isinstance(mask, str | os.PathLike)
+            raise ValueError(f"{where}mask: got {got}; expected a bool array of shape {shape}{remedy}")
         if self.affine is not None and (self.affine.shape != (4, 4) or not np.isfinite(self.affine).all()):
             raise ValueError(f"{where}affine: got shape {self.affine.shape}; expected finite numbers of shape (4, 4)")
         if self.slice_axis not in ((None,) if d == 3 else (None, 0, 1, 2)):
@@ -149,10 +150,10 @@ class TensorVolume:
     def slice(self, axis: int | str, index: int) -> "TensorVolume":
         """Return the slice at an index along an axis (0, 1, 2 or ``"x"``, ``"y"``, ``"z"``) as a volume with d = 2.
 
-        The slice has the in-plane 2×2 block of each tensor. The block of a diffusion tensor D describes diffusion in
-        the slice with the measured in-plane diffusivities, and gives the metric g = (block of D)⁻¹. The block of D⁻¹
-        would instead be the metric induced on the slice as a surface in the volume. The two metrics differ if a
-        principal axis is oblique to the slice.
+        The slice has the in-plane 2×2 block of each tensor. The in-plane block B of a diffusion tensor D describes
+        diffusion in the slice with the measured in-plane diffusivities, and gives the metric B⁻¹. The in-plane block of
+        D⁻¹ would instead be the metric induced on the slice as a surface in the volume. The metric B⁻¹ differs from the
+        induced metric if a principal axis of D is oblique to the slice.
 
         Raises:
             ValueError: the volume is a slice, the axis or index is out of range, or the mask is empty in this slice.

@@ -103,7 +103,7 @@ def _write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, An
 
 
 def by_time(name: str, array: np.ndarray, n: int, extra: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return the array by name if n = 0; if n = 1, return one array per time, whose name contains the time."""
+    """Return the array or, if it has an axis of times (n = 1), one array per time, by names that contain the time."""
     if n == 0:
         return {name: array}
     times = np.ravel(extra.get("times", ()))
@@ -224,7 +224,7 @@ def _on_grid(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 def _as_plane(volume: TensorVolume) -> TensorVolume:
     """Return an image one voxel thick as a slice, if all components of its tensors across the plane are zero."""
     size = np.abs(volume.tensors).max()
-    rounding = 100 * np.finfo(volume.tensors.dtype).eps * size  # due to the rotation to the voxel axes
+    rounding = 100 * np.finfo(volume.tensors.dtype).eps * size  # errors of the tensors' rotation to the voxel axes
     for axis in range(3):
         if volume.shape[axis] == 1 and size > 0 and np.abs(volume.tensors[..., axis, :]).max() <= rounding:
             plane = volume.slice(("x", "y", "z")[axis], 0)

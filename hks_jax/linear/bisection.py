@@ -1,7 +1,8 @@
 """Recursive bisection of a general graph by vertex separators, for nested dissection.
 
-Graph distances from a few remote landmarks serve as coordinates. Every part is cut at the median along its principal
-axis. The separator is a minimum vertex cover of the cut edges (Kőnig's theorem). All parts of a level are cut at once.
+Graph distances from a few landmarks, vertices far from each other, serve as coordinates of the vertices. Each part of
+the graph is cut at the median along the principal axis of its coordinates. The separator is a minimum vertex cover of
+the cut edges (Kőnig's theorem). All parts of one recursion level are cut by the same array operations.
 
 I. S. Duff and others, Direct Methods for Sparse Matrices (2nd edition, Oxford 2017), chapters 8 and 9.
 """
@@ -20,13 +21,13 @@ from scipy.sparse.csgraph import (
 )
 
 _CELL = 50
-"""The largest number of vertices in a cell; larger cells are divided. With cells of 25, solves take longer."""
+"""The largest number of vertices of a cell, which is not divided. With cells of 25 vertices, solves take longer."""
 _LANDMARKS = 8
 _SMOOTHING = 6
 """The number of times that each vertex's distances are averaged with its neighbours' distances, because many integer
-distances are equal. On random closed surfaces, the factors then have as many entries as with the vertices' positions as
-coordinates. The factors are 3 to 8 % larger than those from METIS, whose nested dissection takes about as long, and
-computing the factors takes 12 to 28 % more operations."""
+distances are equal. On random closed surfaces, the factors have as many entries as if vertex positions were the
+coordinates. Compared with METIS, whose nested dissection takes about as long, the factors have 3 to 8 % more entries,
+and the factorisation takes 12 to 28 % more operations."""
 
 
 Ints = Int[np.ndarray, " _"]
@@ -35,9 +36,9 @@ Ints = Int[np.ndarray, " _"]
 class Parts(NamedTuple):
     """A recursive bisection of a graph: part q of a level is divided into parts 2q and 2q + 1 of the next level."""
 
-    # the level of the separator that contains each vertex; vertices of the undivided cells have the last level
+    # for each vertex, the level of the separator that contains it; for vertices of cells, the last level
     level: Int[np.ndarray, " n"]
-    part: Int[np.ndarray, " n"]  # the number, in its level, of the part whose separator (or cell) has the vertex
+    part: Int[np.ndarray, " n"]  # for each vertex, the number q of the part whose separator or cell contains it
     depth: int  # the number of levels
 
 
@@ -49,7 +50,7 @@ def bisect_graph(n: int, rows: Int[np.ndarray, " m"], cols: Int[np.ndarray, " m"
     once = tails < heads
     tails, heads = tails[once], heads[once]
     level, part, side = np.full(n, -1), np.zeros(n, int), np.empty(n, np.int32)
-    # The remaining vertices, grouped by part; each part is sorted along the principal axis of its parent.
+    # Vertices that are in no separator yet are grouped by part; each part is sorted along its parent's principal axis.
     left, x, counts, depth = np.arange(n), _coordinates(graph), np.array([n]), 0
     while True:
         q = np.repeat(np.arange(counts.size), counts)
@@ -84,13 +85,13 @@ def _banded(n: int, rows: Ints, cols: Ints) -> tuple[Ints, csr_matrix]:
     return order, graph
 
 
-# In the additional coordinate, gaps between components are as long as the components. With longer gaps, a single
-# isolated vertex would determine the principal axis.
+# In a disconnected graph, an additional coordinate places the connected components one after another, with gaps as long
+# as the components. With longer gaps between components, a single isolated vertex would determine the principal axis.
 def _coordinates(graph: csr_matrix) -> Float[np.ndarray, "n c"]:
-    """Return distances from landmarks in each component; an additional coordinate places components in sequence."""
+    """Return coordinates of each vertex: averaged graph distances from the landmarks of its component."""
     n = graph.shape[0]
     count, label = connected_components(graph, directed=False)
-    # The first landmark is the first vertex in the banded order, which is far from the last. Distances are below n.
+    # The first landmark of each component is its first vertex in the reverse Cuthill–McKee order, a peripheral vertex.
     nearest, roots = np.arange(2 * n, n, -1), np.empty(count, int)
     distances: list[Int[np.ndarray, " n"]] = []
     for _ in range(_LANDMARKS):
@@ -109,7 +110,6 @@ def _coordinates(graph: csr_matrix) -> Float[np.ndarray, "n c"]:
 
 
 def _largest(values: Int[np.ndarray, " n"], label: Int[np.ndarray, " n"], count: int) -> Int[np.ndarray, " count"]:
-    """Return the maximum of the nonnegative values in each component."""
     largest = np.zeros(count, int)
     np.maximum.at(largest, label, values)
     return largest
@@ -134,7 +134,7 @@ def _distances(graph: csr_matrix, roots: Int[np.ndarray, " r"]) -> Int[np.ndarra
 
 
 def _along_axes(x: Float[np.ndarray, "n c"], q: Ints, counts: Ints) -> Ints:
-    """Return the order that sorts the vertices of each part along its principal axis; parts are contiguous."""
+    """Return the permutation that groups vertices by part, and sorts each part along its principal axis."""
     c, parts = x.shape[1], counts.size
     mean = np.stack([np.bincount(q, column, parts) for column in x.T], axis=1) / np.maximum(counts, 1)[:, None]
     centred = np.ascontiguousarray((x - np.repeat(mean.astype(x.dtype), counts, axis=0)).T)
@@ -152,9 +152,9 @@ def within_groups(counts: Int[np.ndarray, " groups"]) -> Int[np.ndarray, " n"]:
     return np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
-# Kőnig's theorem: for a maximum matching, let Z be the set of vertices that alternating paths (an unmatched edge, a
-# matched edge, …) reach from the unmatched vertices on the left. The left vertices outside Z and the right vertices in
-# Z cover all edges. The cover has as many vertices as the matching has edges, so that no cover is smaller.
+# Kőnig's theorem: for a maximum matching, consider alternating paths (an unmatched edge, a matched edge, …) from the
+# unmatched left vertices. The left vertices that these paths do not reach, and the right vertices that they reach, form
+# a vertex cover. Since this vertex cover has as many vertices as the matching has edges, no cover is smaller.
 def minimum_cover(left: Int[np.ndarray, " m"], right: Int[np.ndarray, " m"]) -> Int[np.ndarray, " s"]:
     """Return a minimum vertex cover of a bipartite graph, given the left and right ends of its edges."""
     lefts, row = np.unique(left, return_inverse=True)

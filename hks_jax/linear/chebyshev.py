@@ -16,7 +16,7 @@ from hks_jax.linear.products import aligned, matmul
 
 _FAILURE = 1e-6
 _START = 30
-"""The safety factor of `lanczos_bound` for its start. It exceeds the square root of the condition number of PD."""
+"""The safety factor of `lanczos_bound` for start vectors with covariance D instead of P⁻¹, at least √cond(PD)."""
 
 Scalar = Float[Array, ""]
 Columns = Float[Array, "*shape b"]
@@ -27,9 +27,9 @@ def chebyshev_recurrence(
     x: Any,  # an array, or a tree of arrays
     degree: int,  # at least 1; static
     total: Any = (),  # the initial value of the accumulated sum
-    add: Callable[[Any, Any, Any], Any] = lambda n, y, total: total,  # (n, yₙ, total) ↦ the total with the term of yₙ
+    add: Callable[[Any, Any, Any], Any] = lambda n, y, total: total,  # (n, yₙ, sum) ↦ the sum plus the n-th term
 ) -> tuple[Any, Any, Any]:
-    """Compute yₙ = Tₙ(A)x by y₁ = Ay₀, yₙ₊₁ = 2Ayₙ − yₙ₋₁ up to n = degree; return the last two yₙ and the total."""
+    """Compute the vectors yₙ = Tₙ(A)x for n ≤ degree by the three-term recurrence; return the last two and the sum."""
 
     def step(n: Array, state: tuple) -> tuple:
         y, before, total = state
@@ -42,25 +42,26 @@ def chebyshev_recurrence(
     return y, before, add(degree, y, total)
 
 
-# Let s(z) = (z − c)/e, where c and e are the interval's centre and half width. Divide the three-term recurrence of the
-# Chebyshev polynomials p_j by p_j(ζ), and let σ_j = p_j(ζ)/p_{j+1}(ζ) = 1/(2s(ζ) − σ_{j−1}). Then z_j = q_j(A) w, where
-# q_j(z) = (p_j(z)/p_j(ζ) − 1)/(z − ζ), satisfies
+# Let p_j(z) = T_j(s(z)) be the Chebyshev polynomials of an interval: s(z) = (z − c)/e, where c is the interval's centre
+# and e is its half width. If the three-term recurrence of the polynomials is divided by the number p_{j+1}(ζ), the
+# recurrence of the vectors z_j = q_j(A) w follows, where q_j(z) = (p_j(z)/p_j(ζ) − 1)/(z − ζ):
 #
-#     z_{j+1} = (2σ_j/e) ((A − c) z_j + w) − σ_j σ_{j−1} z_{j−1},    z_0 = 0,   z_1 = (σ_0/e) w,   σ_0 = 1/s(ζ).
+#     z_{j+1} = (2σ_j/e) ((A − c) z_j + w) − σ_j σ_{j−1} z_{j−1},    z_0 = 0,    z_1 = (σ_0/e) w.
 #
-# `chebyshev_recurrence` computes p(A), not q(A), and would overflow if ζ is far from the interval.
+# The coefficients are the quotients σ_j = p_j(ζ)/p_{j+1}(ζ) = 1/(2s(ζ) − σ_{j−1}), where σ_0 = 1/s(ζ).
+# `chebyshev_recurrence` computes the vector p(A)w instead, and would overflow if the number ζ is far from the interval.
 def chebyshev_iteration(
-    product: Callable[[Columns], Columns],
+    product: Callable[[Columns], Columns],  # x ↦ Ax
     w: Columns,
     low: Scalar,
     high: Scalar,
-    value: Float[Array, "*b"] | float,  # ζ outside the interval, one for each column or one for all
+    value: Float[Array, "*b"] | float,  # the number ζ outside the interval, for each column or for all
     degree: Int[Array, ""] | int,  # the degree of p
 ) -> Columns:
     """Return q(A)w, where q(z) = (p(z)/p(ζ) − 1)/(z − ζ) and p is the Chebyshev polynomial of [low, high].
 
-    If the spectrum of A lies in the interval, −q(A)w is the result of Chebyshev iteration for (A − ζ)x = w, with
-    residual p(A)w/p(ζ). ``product`` is x ↦ Ax, and ``value`` is ζ.
+    If the spectrum of A lies in the interval, Chebyshev iteration for the system (A − ζ)x = w gives the solution
+    −q(A)w, whose residual is p(A)w/p(ζ).
     """
     centre, half = (high + low) / 2, (high - low) / 2
     s = (value - centre) / half
@@ -88,13 +89,13 @@ def chebyshev_iteration(
     return jax.lax.fori_loop(0, (degree - 1 + missing) // together, turn, first)[1]
 
 
-# The coefficients of exp(−tλ) on 0 ≤ λ ≤ top are (−1)ⁿ 2 e^(−z) Iₙ(z) for n > 0 and e^(−z) I₀(z), where z = t·top/2.
+# On 0 ≤ λ ≤ top, exp(−tλ) has the Chebyshev coefficients e^(−z) I₀(z) and 2 (−1)ⁿ e^(−z) Iₙ(z), where z = t·top/2.
 @partial(jax.jit, static_argnames="degree")
 def chebyshev_heat_coefficients(
     times: Float[Array, " m"], top: Scalar | float, degree: int
 ) -> Float[Array, "m {degree}+1"]:
     """Return the Chebyshev coefficients of exp(−tλ), by a cosine transform of samples, which JAX can differentiate."""
-    samples = degree + 32 + 4 * math.isqrt(degree)  # aliases have indices ≥ 2·samples − degree
+    samples = degree + 32 + 4 * math.isqrt(degree)  # aliased coefficients have degrees ≥ 2·samples − degree
     angles = (np.arange(samples) + 0.5) * (np.pi / samples)
     weights = np.cos(np.outer(angles, np.arange(degree + 1))) * (2 / samples)
     weights[:, 0] /= 2
@@ -103,9 +104,9 @@ def chebyshev_heat_coefficients(
 
 
 def coefficient_tails(z: float) -> Float[np.ndarray, " n_and_1"]:
-    """Return, for each n, the sum of the absolute Chebyshev coefficients of exp(−tλ) from n on, where z = t·top/2.
+    """Return, for each n, the sum of the absolute values of the n-th and all later Chebyshev coefficients of exp(−tλ).
 
-    Coefficients below 1e-25 are omitted. The last sum is 0.
+    For the interval 0 ≤ λ ≤ top, the argument z is t·top/2. Coefficients below 1e-25 are omitted. The last sum is 0.
     """
     n = np.arange(int(math.sqrt(2 * z * 60) + 60) + 1)
     sizes = np.where(n == 0, 1, 2) * scipy.special.ive(n, z)
@@ -126,16 +127,16 @@ def gershgorin(entries: Float[Array, "offsets *shape"], inverse: Float[Array, "*
 def lanczos_bound(
     apply: Callable[[Array], Array],  # x ↦ Kx
     solve: Callable[[Array], Array],  # r ↦ Pr
-    sums: Float[Array, "..."],  # a diagonal D ≈ P⁻¹ with the shape of x; 0 outside the degrees of freedom
+    sums: Float[Array, "..."],  # a diagonal approximation D of P⁻¹; 0 at nodes that are not free
     n: int,  # the number of degrees of freedom
     steps: int,
 ) -> Scalar:
     """Return an upper bound of the eigenvalues of PK by Lanczos iteration.
 
-    From a random start, the largest Ritz value θ of k steps and the largest eigenvalue λ satisfy λ(1 − ε) ≤ θ ≤ λ with
-    probability at least 1 − 1.648 √n exp(−√ε (2k − 1)) (Kuczyński and Woźniakowski 1992, theorem 4.2). The result is
-    θ/(1 − ε) for the ε at which the probability of failure is 10⁻⁶. The start is normally distributed with respect to D
-    instead of P⁻¹; a safety factor accounts for the difference.
+    After k steps from a random vector, the largest Ritz value θ and the largest eigenvalue λ satisfy λ(1 − ε) ≤ θ ≤ λ
+    with probability at least 1 − 1.648 √n exp(−√ε (2k − 1)) (Kuczyński and Woźniakowski 1992, theorem 4.2). The result
+    is θ/(1 − ε), where ε is such that the result is below λ with probability at most 10⁻⁶. The random vector has
+    covariance D instead of P⁻¹; a safety factor compensates for the difference.
     """
     r = jnp.sqrt(sums) * jax.random.normal(jax.random.key(0), sums.shape, sums.dtype)
 

@@ -1,9 +1,9 @@
 """Kernels for CUDA devices that fuse the operations of block Lanczos on blocks of a few long columns.
 
-With XLA operations, it takes four launches to compute inner products of columns and to combine the columns by them: for
-partial sums, their sum, a small matrix computed from the sum, and the combined columns. In this module, the partial
-sums are the input of a second kernel. Each program of this kernel adds the partial sums, computes the small matrix, and
-combines its own rows.
+Orthogonalisation computes inner products of columns, and combines the columns with coefficients from these products.
+XLA launches four kernels for this task: for partial sums of the inner products, for their sum, for the coefficients,
+and for the combined columns. This module launches only two kernels. The first kernel computes the partial sums. In the
+second kernel, each thread block adds all partial sums, computes the coefficients, and combines its rows of the columns.
 """
 
 from collections.abc import Callable
@@ -20,18 +20,18 @@ LARGEST = 32
 """The largest number of columns of a block."""
 _SMALLEST = 8
 _NUMBERS = 1 << 13
-"""The number of sums that a program accumulates simultaneously."""
+"""The number of running sums that one thread block of a kernel accumulates in parallel."""
 _PARTS, _ROWS = 256, 512
 """The maximal number of partial sums, and the least number of rows per partial sum."""
 
 Block = Float[Array, "n b"]
 Small = Float[Array, "b b"]
 Parts = Float[Array, "parts b b"]
-"""Partial sums of a small matrix."""
+"""Matrices whose sum is a small matrix, such as xᵀy."""
 
 
 def parts_of_products(x: Block, y: Block) -> Parts:
-    """Return partial sums of xᵀy."""
+    """Return matrices whose sum is xᵀy, one for each range of rows."""
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
@@ -68,9 +68,9 @@ def parts_of_products(x: Block, y: Block) -> Parts:
 
 
 def remainder(x: Block, block: Block, parts: Parts, before: tuple[Block, Small] | None = None) -> tuple[Block, Small]:
-    """Return x − block·D, and D, given partial sums of D.
+    """Return the block x − yD and the matrix D, where y is ``block`` and D is the sum of ``parts``.
 
-    With ``before`` = (previous block, coefficients), subtract their product too, and use the symmetric part of D.
+    If ``before`` = (u, C) is given, return x − yS − uC and S instead, where S is the symmetric part of D.
     """
     columns, matrices = ((x, block), ()) if before is None else ((x, block, before[0]), before[1:])
 
@@ -83,10 +83,10 @@ def remainder(x: Block, block: Block, parts: Parts, before: tuple[Block, Small] 
 
 
 def orthonormal(parts: Parts, columns: tuple[Block, ...], before: Small) -> tuple[tuple[Block, ...], Small]:
-    """Return the blocks ``columns`` times F⁻ᵀ, and ``before`` times F, where FFᵀ = G, given partial sums of G.
+    """Factorise G = FFᵀ, the sum of ``parts``; return each block in ``columns`` times F⁻ᵀ, and ``before`` times F.
 
-    If G = xᵀMx, the columns of xF⁻ᵀ are M-orthonormal. F is computed by pivoted Cholesky factorisation of G, scaled to
-    unit diagonal. Pivots below rounding level, which belong to linearly dependent columns, are raised to this level.
+    If G = xᵀMx, the columns of xF⁻ᵀ are M-orthonormal. A pivoted Cholesky factorisation of G, scaled to unit diagonal,
+    gives the factor F. Pivots below rounding level, as of linearly dependent columns, are raised to this level.
     """
     b = len(before)
     floor = b * float(jnp.finfo(before.dtype).eps)
@@ -218,10 +218,10 @@ def _product(x: Float[Array, "m s"], y: Float[Array, "s s"]) -> Float[Array, "m 
 
 
 def _pivoted_cholesky(a: Small, floor: float, rank: int) -> tuple[Small, Small]:
-    """Return the first ``rank`` columns of F with FFᵀ = A, and of F⁻ᵀ; pivots below ``floor`` are raised to it.
+    """Return the first ``rank`` columns of F and of F⁻ᵀ, where A = FFᵀ; pivots below ``floor`` are raised to ``floor``.
 
-    Let p be the k-th pivot row. Since F[p, j] = 0 for j > k, column p of CFᵀ = I gives the k-th column of C = F⁻ᵀ:
-    F[p, k] C[:, k] = e_p − Σ_{j<k} F[p, j] C[:, j].
+    In the k-th pivot row p of the factor F, the entries F[p, j] are 0 for j > k. Column p of the equation CFᵀ = I
+    therefore gives the k-th column of C = F⁻ᵀ from earlier columns: F[p, k] C[:, k] = e_p − Σ_{j<k} F[p, j] C[:, j].
     """
     index = jax.lax.broadcasted_iota(jnp.int32, (a.shape[0],), 0)
 

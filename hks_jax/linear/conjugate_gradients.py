@@ -21,20 +21,20 @@ _KEPT, _MEMORY = 400, 4e8
 class Solution(NamedTuple):
     """The state of conjugate gradients for one block of columns. For finished columns, r and p are zero."""
 
-    x: Float[Array, "n b"]  # the solutions so far; finally NaN if a product was NaN
+    x: Float[Array, "n b"]  # the approximate solutions; at the end, NaN for columns in which NaN occurred
     rhs: Float[Array, "n b"]  # the right-hand sides
     r: Float[Array, "n b"]  # the residuals
     z: Float[Array, "n b"]  # the preconditioned residuals
     p: Float[Array, "n b"]  # the next search directions
-    first: Float[Array, " b"]  # the initial rᵀz
-    energy: Float[Array, " b"]  # the current rᵀz
-    change: Float[Array, " b"]  # the current rᵀz divided by the previous rᵀz
+    first: Float[Array, " b"]  # the inner products rᵀz at the first step
+    energy: Float[Array, " b"]  # the inner products rᵀz at the current step
+    change: Float[Array, " b"]  # the inner products rᵀz divided by those at the previous step
     errors: Float[Array, " b"]  # estimated relative errors divided by the wanted errors; at most 1 if converged
-    going: Bool[Array, " b"]  # whether each column continues
+    going: Bool[Array, " b"]  # whether the iteration of each column goes on
     fresh: Bool[Array, ""]  # whether the next step is the first, or the first after a restart
     starts: Int[Array, ""]  # the number of restarts
-    steps: Int[Array, ""]  # the number of steps; −1 before the right-hand side is computed
-    # the residuals r and z of all steps, divided by √(rᵀz); None without reorthogonalisation
+    steps: Int[Array, ""]  # the number of steps; −1 if the next product is the right-hand side
+    # the residuals r and preconditioned residuals z of all steps, divided by √(rᵀz); None without reorthogonalisation
     kept: tuple[Float[Array, "m n"], Float[Array, "m n"]] | None
 
     @property
@@ -45,8 +45,9 @@ class Solution(NamedTuple):
 
 
 def conjugate_gradients(
-    product: Callable[..., tuple[Array, Array]],  # x ↦ Aᵢxᵢ, and the energies below which Aᵢ counts as singular
-    precondition: Callable[[Array], Array],  # r ↦ an approximation of Aᵢ⁻¹rᵢ
+    # maps columns xᵢ to the products Aᵢxᵢ, and to values of xᵢᵀAᵢxᵢ at or below which Aᵢ counts as singular
+    product: Callable[..., tuple[Array, Array]],
+    precondition: Callable[[Array], Array],  # maps residuals rᵢ to approximations of Aᵢ⁻¹rᵢ
     rhs: Float[Array, "n b"],
     wanted: Float[Array, " b"],  # the wanted relative error in the energy norm; if infinite, the column stays zero
     inner: Callable[[Array, Array], Array] = lambda x, y: (x * y).sum(axis=0),
@@ -59,11 +60,11 @@ def conjugate_gradients(
     Args:
         inner: the function that returns the inner products (b,) of two blocks of columns. All Aᵢ and the preconditioner
             must be symmetric and positive definite with respect to ``inner``.
-        clean: the projection x ↦ Px on the subspace in which the Aᵢ are positive definite. If rounding has led x out of
-            the subspace, an energy is not positive; then the iteration restarts from Px.
-        orthogonal: whether to reorthogonalise residuals, for one ill-conditioned matrix (b = 1) with expensive
-            products, in JAX. Then ``product(x, first)`` returns the right-hand side if ``first`` is true, so that
-            operations common to right-hand side and products are compiled once. Of ``rhs``, only the shape matters.
+        clean: the projection onto the subspace in which all Aᵢ are positive definite. If rounding makes an inner
+            product rᵢᵀzᵢ or pᵢᵀAᵢpᵢ nonpositive, the iteration restarts from the projected solutions.
+        orthogonal: whether to reorthogonalise residuals, which reduces the number of steps for ill-conditioned
+            matrices. Reorthogonalisation requires JAX arrays with b = 1. If ``orthogonal`` and ``first`` are true,
+            ``product(x, first)`` must return the right-hand side, which may share compiled operations with products.
     """
     xp, n = rhs.__array_namespace__(), len(rhs)
 
@@ -94,12 +95,12 @@ def conjugate_gradients(
         x, r, again = state.x + wide * p, state.r - wide * image, begin
         kept = state.kept
         if kept is not None:
-            # In exact arithmetic, residuals satisfy rᵢᵀPrⱼ = 0 for i ≠ j, where P is the preconditioner. Rounding
-            # destroys this orthogonality once an extreme Ritz pair has converged, and the method then finds that
-            # eigenvector repeatedly. If eigenvalues decay over eight decades, the repetitions double the number of
-            # steps. If products are expensive and n is small, reorthogonalisation is cheaper (Paige 1971; Simon 1984).
-            # If the memory is full, the last place is overwritten, because the early residuals keep the pairs that
-            # converged first from returning.
+            # In exact arithmetic, residuals of different steps satisfy rᵢᵀPrⱼ = 0, where P is the preconditioner.
+            # Rounding destroys this orthogonality once an extreme Ritz pair has converged, and the iteration finds this
+            # pair again (Paige 1971; Simon 1984). If eigenvalues decay over eight decades, the repetitions double the
+            # number of steps. Reorthogonalisation takes less time than additional steps if products with the matrix are
+            # expensive and n is small. If the memory for residuals is full, each new residual overwrites the last row.
+            # The first residuals stay, because they prevent repetitions of the first converged pairs.
             at, root = jnp.clip(state.steps, 0, len(kept[0]) - 1), jnp.sqrt(state.energy)
             kept = kept[0].at[at].set(state.r[:, 0] / root), kept[1].at[at].set(state.z[:, 0] / root)
             r = r - matmul(kept[0].T, products_with_columns(kept[1], r))

@@ -37,14 +37,14 @@ def eigh(A: Any, B: Any = None, *, multiplet_tolerance: float | None = None) -> 
     exact. At multiple eigenvalues, derivatives of projectors on eigenspaces are exact, and so are derivatives of sums
     of f(λ) that include all equal eigenvalues, such as tr f(A).
 
-    A single eigenvector of a multiple eigenvalue has no derivative. The rule returns an eigenvector derivative without
-    rotation within the eigenspace, and a diagonal entry of VᵀȦV as the derivative of each eigenvalue, where Ȧ is the
-    change of A. **At a multiple eigenvalue, the derivative of V f(Λ) Vᵀ through V and Λ is therefore wrong: use
-    `matrix_function`**, which is exact everywhere. No rule for V and Λ could be exact: at A = I the derivative of f(A)
-    along Ȧ is f'(1) Ȧ, but Λ̇ and a rotation of V give only the diagonal of VᵀȦV.
+    A single eigenvector of a multiple eigenvalue has no derivative. The derivative that this function defines for
+    eigenvectors contains no rotation within an eigenspace. The derivatives of eigenvalues are the diagonal entries of
+    VᵀȦV, where Ȧ is the change of A. The derivative of V f(Λ) Vᵀ through V and Λ is therefore **wrong at multiple
+    eigenvalues: use `matrix_function`**, which is exact at all eigenvalues.
 
-    Eigenvectors of nearly equal eigenvalues, and their derivatives, have errors of about ε|λ|/gap. Derivatives of
-    functions of a whole cluster have the same errors, unless the gaps are below `multiplet_tolerance`.
+    Eigenvectors of nearly equal eigenvalues, and derivatives of these eigenvectors, have errors of about ε|λ|/gap,
+    where ε is the machine precision. Derivatives of functions of a whole cluster of eigenvalues also have errors of
+    about ε|λ|/gap, unless all gaps within the cluster are below `multiplet_tolerance`.
 
     Second derivatives are exact if all eigenvalues are simple, and NaN otherwise.
 
@@ -79,19 +79,19 @@ def eigh(A: Any, B: Any = None, *, multiplet_tolerance: float | None = None) -> 
 def differentiable_eigh(tolerance: float | None, a: Matrix) -> tuple[Values, Matrix]:
     """Return the eigenvalues of a symmetric matrix, ascending, and orthonormal eigenvectors in columns.
 
-    With a tolerance, derivatives are those of `eigh`. Without a tolerance, derivatives are NaN at equal eigenvalues.
+    If ``tolerance`` is a number, derivatives are those of `eigh`; if it is None, they are NaN at equal eigenvalues.
     """
     return lapack.eigh(a)
 
 
-# The equations AV = VΛ and VᵀV = I give, with G = VᵀȦV,
+# Let G = VᵀȦV, where Ȧ is the change of A. The equations AV = VΛ and VᵀV = I give the changes of Λ and V:
 #
 #     λ̇ᵢ = Gᵢᵢ,    V̇ = VΩ,    Ωᵢⱼ = Gᵢⱼ/(λⱼ − λᵢ) for i ≠ j.
 #
-# Ω is antisymmetric. In the derivative of VₑVₑᵀ, the projector on an eigenspace, the entries of Ω within the eigenspace
-# cancel, so that the rule may set them to zero. The derivative of tr f(A) = Σ f(λᵢ) does not contain Ω. Second
-# derivatives contain the derivative of 1/gap, which is NaN at equal eigenvalues, because a sum such as Σᵢ f'(λᵢ) Gᵢᵢ
-# depends on the omitted entries.
+# In the derivative of VₑVₑᵀ, the projector on an eigenspace, the entries of the antisymmetric matrix Ω within the
+# eigenspace cancel, so that the derivative rule may set these entries to zero. The derivative of tr f(A) = Σ f(λᵢ) does
+# not contain the matrix Ω. Second derivatives, such as that of Σᵢ f'(λᵢ) Gᵢᵢ, depend on the entries of Ω that are set
+# to zero; at equal eigenvalues, `_inverse_gaps` therefore has the derivative NaN.
 @differentiable_eigh.defjvp
 def _eigh_jvp(tolerance: float | None, primals: tuple[Array], tangents: tuple[Array]) -> tuple[tuple, tuple]:
     values, vectors = differentiable_eigh(tolerance, primals[0])
@@ -102,7 +102,7 @@ def _eigh_jvp(tolerance: float | None, primals: tuple[Array], tangents: tuple[Ar
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _inverse_gaps(tolerance: float | None, values: Values) -> Matrix:
-    """Return 1/(λⱼ − λᵢ), with 0 on the diagonal; for equal eigenvalues return 0, or NaN if there is no tolerance."""
+    """Return 1/(λⱼ − λᵢ), with 0 on the diagonal. Equal eigenvalues give 0, or NaN if ``tolerance`` is None."""
     gap, apart = _gaps(tolerance, values)
     equal = 0 if tolerance is not None else jnp.where(jnp.eye(len(values), dtype=bool), 0, jnp.nan)
     return jnp.where(apart, 1 / jnp.where(apart, gap, 1), equal)
@@ -134,8 +134,8 @@ def standard_form(a: Matrix, b: Matrix) -> tuple[Matrix, Matrix]:
     return lapack.triangular_solve(factor, half.T), factor
 
 
-# Let L̇ = LP with P lower triangular. Then Ḃ = L̇Lᵀ + LL̇ᵀ gives P + Pᵀ = L⁻¹ḂL⁻ᵀ. For C = L⁻¹AL⁻ᵀ it follows that
-# Ċ = L⁻¹ȦL⁻ᵀ − PC − CPᵀ.
+# Write the change of the Cholesky factor L as L̇ = LP, where the matrix P is lower triangular. The change Ḃ = L̇Lᵀ +
+# LL̇ᵀ of B gives the equation P + Pᵀ = L⁻¹ḂL⁻ᵀ for P. The matrix C = L⁻¹AL⁻ᵀ has the change Ċ = L⁻¹ȦL⁻ᵀ − PC − CPᵀ.
 @standard_form.defjvp
 def _standard_form_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[tuple, tuple]:
     reduced, factor = standard_form(*primals)
@@ -197,7 +197,6 @@ def checked_standard_form(A: Any, B: Any) -> tuple[Matrix, Matrix | None]:
 
 
 def _symmetric(name: str, matrix: Any) -> Matrix:
-    """Check a user's matrix and return its symmetric part."""
     array = real_array(name, matrix)
     if array.ndim != 2 or array.shape[0] != array.shape[1] or array.size == 0:
         raise ValueError(f"{name}: got shape {array.shape}; expected (n, n). Use jax.vmap for several matrices")

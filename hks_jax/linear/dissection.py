@@ -1,8 +1,9 @@
 """Nested dissection: an elimination order of a sparse matrix's rows, and the structure of its fronts.
 
-A separator divides the graph into two halves that the matrix does not couple. Further separators divide the halves
-recursively, down to small cells. Elimination goes from the cells up to the first separator. All fronts of a level are
-independent and of nearly equal size; padded to the largest size, they form one batch of dense blocks.
+A separator divides the graph of the matrix into two halves that the matrix does not couple. Each half is divided
+recursively by its own separator, down to small cells. Elimination goes from the cells up to the first separator. A
+front is the dense matrix block in which a separator or a cell is eliminated. All fronts of a level are independent and
+of nearly equal size; padded to the largest size, they form one batch of dense blocks.
 
 A. George, Nested dissection of a regular finite element mesh, SIAM J. Numer. Anal. 10 (1973).
 """
@@ -22,7 +23,6 @@ _TRAFFIC = 20e6
 _LAUNCHES = 4
 """The number of kernel launches per level in a solve: a gather and a product, both upwards and downwards."""
 _BYTES = 8
-"""The size of a number."""
 _ALIGNED = 64
 """Large fronts have a multiple of this number of nodes; otherwise XLA would copy their matrices to pad them."""
 
@@ -32,33 +32,31 @@ Ints = Int[np.ndarray, " _"]
 class Level(NamedTuple):
     """The fronts of one level. A front eliminates s own nodes; r boundary nodes coupled to it are eliminated later.
 
-    In smaller fronts, indices are padded with the first number that is out of range.
+    If a front has fewer nodes than the largest front, its indices are padded with the length of the indexed array.
     """
 
     own: Int[np.ndarray, "fronts s"]  # the eliminated degrees of freedom
-    # the places of the boundary nodes among the (fronts, s + r) nodes of the level above
+    # the index of each boundary node in the flattened array (fronts, s + r) of all nodes of the level above
     boundary: Int[np.ndarray, "fronts r"]
-    # the places of the front's nodes among the (fronts, r) boundary nodes of the level below. A node has up to c such
-    # places; in an elimination tree, one for each child. For cells, the array is empty
+    # the indices of each of the front's nodes in the flattened array (fronts, r) of the boundary nodes of the level
+    # below. A node has at most c indices; in an elimination tree, one for each child front. Cells have an empty array
     children: Int[np.ndarray, "c fronts s_plus_r"]
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """The shape (fronts, s + r, s) of the blocks with the columns of the own nodes."""
+        """The shape (fronts, s + r, s) of the matrix blocks with rows of all nodes and columns of own nodes."""
         fronts, s = self.own.shape
         return fronts, s + self.boundary.shape[1], s
 
 
 class Merged(NamedTuple):
-    """The merged tree, which solves use instead of the elimination tree."""
+    """The merged tree, which solves on accelerators use instead of the elimination tree."""
 
     levels: tuple[Level, ...]  # the merged levels
-    order: Int[np.ndarray, " n_dof"]  # the place of each degree of freedom among the levels' concatenated own nodes
-    # for each merged level and each tree level merged in it: the places of the tree level's own nodes (fronts, s)
-    # among those of the merged level; out of range for padding
+    order: Int[np.ndarray, " n_dof"]  # the index of each degree of freedom in the concatenated ``own`` of all levels
+    # the index of each own node of a tree level in the flattened ``own`` of its merged level; out of range for padding
     rows: tuple[tuple[Int[np.ndarray, "_fronts _s"], ...], ...]
-    # for each merged level: the places of its own nodes (fronts, s) among the concatenated own nodes of its tree
-    # levels; out of range for padding
+    # the index of each own node of a merged level in the joined ``own`` of its tree levels; out of range for padding
     places: tuple[Int[np.ndarray, "_fronts _s"], ...]
 
 
@@ -67,15 +65,14 @@ class Dissection(NamedTuple):
 
     # from the first separator to the cells; level l has 2^l fronts, and front q has children 2q and 2q + 1
     levels: tuple[Level, ...]
-    order: Int[np.ndarray, " n_dof"]  # the place of each degree of freedom among the levels' concatenated own nodes
-    # the indices of the needed matrix entries in the array of entries; None means all entries in order
+    order: Int[np.ndarray, " n_dof"]  # the index of each degree of freedom in the concatenated ``own`` of all levels
+    # the indices of the matrix entries that elimination reads, in the array of entries; None if all entries are listed
     entries: Int[np.ndarray, " m"] | None
-    # the places of these entries in the concatenated blocks (fronts, s + r, s) of all levels. Of two entries equal by
-    # symmetry, only the entry whose row is not eliminated before its column is needed. If all entries are listed,
-    # unneeded entries have places out of range
+    # the index of each listed entry in the concatenated blocks (fronts, s + r, s) of all levels. If an entry's row is
+    # eliminated before the front of its column, only the transposed entry is read, and the index is out of range
     places: Int[np.ndarray, " m"]
-    padding: Int[np.ndarray, " p"]  # the places of the diagonal entries of padding nodes
-    merged: Merged | None  # the merged tree for solves on accelerators; None if solves use the tree itself
+    padding: Int[np.ndarray, " p"]  # the indices of padding's diagonal entries in the concatenated blocks
+    merged: Merged | None  # the merged tree for solves on accelerators; None if solves use the elimination tree
 
 
 def dissect(pattern: Pattern) -> Dissection:
@@ -93,15 +90,15 @@ def _dissect(pattern: Pattern, merge: bool) -> Dissection:
     n = pattern.size
     level, front, depth = pattern.bisect()
     own, slot = _own_nodes(level, front, depth)
-    # Positive if an entry's row is eliminated before its column, zero if on the same level, negative if after it.
+    # The difference of levels is positive if an entry's row is eliminated before its column, and negative if after it.
     order_of_ends = level[rows] - level[cols]
     above = np.flatnonzero(order_of_ends > 0)
     boundaries = _boundaries(level, front, depth, rows[above], cols[above])
     ranks = [within_groups(np.bincount(keys // n)) for keys in boundaries]
-    # The width of the boundary arrays is at least 1; if no front is coupled to its parent, this column is padding. On
-    # the first level, which has no parent, the width is 0.
+    # Arrays of boundary nodes have at least one column, which is padding if no front is coupled to its parent. Only on
+    # the first level, whose front has no parent, arrays of boundary nodes have no columns.
     width = [int(rank.max(initial=min(number, 1) - 1)) + 1 for number, rank in enumerate(ranks)]
-    # List each boundary node's front, and the node's place among the own and boundary nodes of the parent.
+    # For each boundary node, find its front, and its index among the own and boundary nodes of the parent front.
     placed = [(keys // n, slot[keys % n]) for keys in boundaries]
     for below, (at, place) in enumerate(placed[1:]):
         nodes = boundaries[below + 1] % n
@@ -128,7 +125,10 @@ def _dissect(pattern: Pattern, merge: bool) -> Dissection:
     _, height, stride = shapes = np.array([level.shape for level in levels]).T
     start = np.append(0, np.cumsum(np.prod(shapes, axis=0)))
     if start[-1] > np.iinfo(np.int32).max:
-        raise ValueError(f"matrix: got {n} rows, whose factors have {start[-1]} entries; expected fewer than 2^31")
+        raise ValueError(
+            f"matrix: got {n} rows, whose factors have {start[-1]} entries; expected fewer than 2^31. Use a coarser "
+            "grid or mesh, or the Chebyshev filter, which does not factorise"
+        )
     mine = np.flatnonzero(order_of_ends <= 0)
     rows, cols, eliminated = rows[mine], cols[mine], level[cols[mine]]
     place = slot[rows]
@@ -152,7 +152,7 @@ def _dissect(pattern: Pattern, merge: bool) -> Dissection:
 
 
 def _listed(entries: Ints, places: Ints, number: int, end: int) -> tuple[Ints | None, Ints]:
-    """Return the needed entries and their places; or None and the places of all entries, if this takes less memory."""
+    """Return ``entries`` and ``places`` of `Dissection`, with all matrix entries listed if this takes less memory."""
     others = number - entries.size
     if others > entries.size or end + others > np.iinfo(np.int32).max:
         return entries.astype(np.int32), places.astype(np.int32)
@@ -163,7 +163,7 @@ def _listed(entries: Ints, places: Ints, number: int, end: int) -> tuple[Ints | 
 
 
 def _own_nodes(level: Ints, front: Ints, depth: int) -> tuple[list[np.ndarray], Ints]:
-    """Return the own nodes (fronts, s) of each level's fronts, and the place of every node in its front."""
+    """Return the own nodes (fronts, s) of each level's fronts, and the index of every node in its front."""
     n, own, slot = level.size, [], np.zeros(level.size, np.int32)
     for number in range(depth):
         nodes = np.flatnonzero(level == number)
@@ -178,8 +178,8 @@ def _own_nodes(level: Ints, front: Ints, depth: int) -> tuple[list[np.ndarray], 
 def _boundaries(level: Ints, front: Ints, depth: int, rows: Ints, cols: Ints) -> list[Ints]:
     """Return the boundary nodes of each level's fronts as sorted keys front·n + node.
 
-    A front's boundary nodes are eliminated later. Such a node is coupled to the front's own nodes by an entry (row,
-    column), or inherited from the boundary of a child.
+    Boundary nodes of a front are eliminated after the front. An entry (row, column) couples a boundary node to an own
+    node of the front, or the node is a boundary node of a child front.
     """
     n, keys, boundaries = level.size, np.empty(0, int), []
     eliminated, keys_of = level[rows], front[rows] * n + cols
@@ -193,9 +193,8 @@ def _boundaries(level: Ints, front: Ints, depth: int, rows: Ints, cols: Ints) ->
 
 # On accelerators, solves use a merged tree: a front and its descendants on following levels become one front with an
 # explicit inverse. Merging increases memory traffic but reduces kernel launches; the groups of levels are chosen for
-# the least total cost. The factorisation, which also gives the inertia, still uses the elimination tree. The method is
-# that of F. L. Alvarado, A. Pothen and R. Schreiber, Highly parallel sparse triangular solution, in Graph Theory and
-# Sparse Matrix Computation (Springer 1993).
+# the least total cost. The factorisation, which also gives the inertia, still uses the elimination tree (Alvarado,
+# Pothen and Schreiber, in Graph Theory and Sparse Matrix Computation, Springer 1993).
 def merged(levels: tuple[Level, ...], n: int) -> Merged:
     """Merge levels of the elimination tree of n degrees of freedom."""
     groups = divided(levels, n)
@@ -277,7 +276,7 @@ def _boundary_nodes(levels: tuple[Level, ...], n: int) -> list[np.ndarray]:
 
 
 def _find(nodes: np.ndarray, front: np.ndarray, node: np.ndarray, n: int) -> np.ndarray:
-    """Return the flat places of given nodes of given fronts in an array of nodes (fronts, m)."""
+    """Return, for each pair (front, node), the flat index of ``node`` in row ``front`` of the array ``nodes``."""
     keys = (np.arange(len(nodes))[:, None] * (n + 1) + nodes).ravel()
     ascending = np.argsort(keys, kind="stable")
     return ascending[np.searchsorted(keys, front * (n + 1) + node, sorter=ascending)]

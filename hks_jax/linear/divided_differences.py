@@ -14,7 +14,7 @@ def divided_difference(f: Function, low: Float[Array, "*n"], high: Float[Array, 
     """Return f[a, b] = (f(b) − f(a))/(b − a) for a ≤ b, and f'(a) where a = b.
 
     The divided difference is also the mean of f' over [a, b]. The difference quotient is inaccurate for close a and b;
-    Gauss quadrature of the mean is inaccurate for distant a and b. `_mean_or_quotient` chooses one of the two.
+    Gauss quadrature of the mean of f' is inaccurate for distant a and b. `_mean_or_quotient` chooses one formula.
     """
     gap = high - low
     slope = _derivative(f)
@@ -41,8 +41,8 @@ def second_divided_difference(
 ) -> Float[Array, "*n"]:
     """Return f[a, b, c] for a ≤ b ≤ c, and f''(a)/2 where a = b = c, given f[a, b] and f[b, c].
 
-    The scale is the largest magnitude of all first divided differences. The error of the result is about the rounding
-    error of the scale, also where f' is much smaller, as for f' = 1 − tanh².
+    The argument ``scale`` is the largest magnitude of all first divided differences of f. The error of
+    (c − a) f[a, b, c] is about ε·``scale``, even where f' is much smaller than ``scale``, as for f = tanh.
     """
     curvature = _derivative(_derivative(f))
 
@@ -65,14 +65,15 @@ def _mean_or_quotient(
     change: Float[Array, "*n"],
     size: Float[Array, "..."],
 ) -> Float[Array, "*n"]:
-    """Return the mean if two quadrature rules and the quotient agree to within their errors, otherwise the quotient.
+    """Return the mean ``fine`` if it agrees with ``coarse`` and the quotient to within errors, otherwise the quotient.
 
-    The quotient is the change divided by the gap. The change is the difference of two terms of the given size.
+    Gauss quadrature gives both means. The quotient is ``change``/``gap``; ``change`` is a difference of two numbers of
+    magnitude ``size``.
     """
     eps = jnp.finfo(gap.dtype).eps
     apart = gap > 0
     smooth = jnp.abs(fine - coarse) * gap <= eps * size
-    # Both rules may miss a sharp transition, which the quotient includes.
+    # Both quadrature rules may miss a sharp transition of the function, which the quotient includes.
     smooth &= jnp.abs(fine * gap - change) <= jnp.sqrt(eps) * size
     return jnp.where(~apart | smooth, fine, change / jnp.where(apart, gap, 1))
 

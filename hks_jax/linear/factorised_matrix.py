@@ -1,4 +1,4 @@
-"""A factorised symmetric matrix. Solves, determinant and inverse are differentiable with respect to its entries."""
+"""Factorised symmetric matrices. Solves, determinant and inverse are differentiable with respect to matrix entries."""
 
 import math
 from collections.abc import Callable
@@ -27,13 +27,13 @@ _PROBES = 4
 _LEAST_PIVOT = 0.375
 """The least pivot of a second factorisation is ε to this power, relative to the front's entries."""
 _DOUBTFUL = 0.01
-"""The least error of determinants and inverses that causes a warning."""
+"""The estimated error of a determinant or an inverse above which a warning is issued."""
 _BACKWARD = 4
 """The backward error, in units of ε, at which refinement of solutions stops."""
 _NULL = 1000
-"""The largest singular value that an error message counts as zero, in units of ε‖A‖."""
+"""Error messages count singular values as zero if they are at most this number times ε‖A‖."""
 _SEARCHED, _TURNS = 16, 4
-"""The number of null vectors that an error message searches for, and the number of iterations."""
+"""The largest number of null vectors that an error message reports, and the number of iterations that compute them."""
 
 
 Scalar = Float[Array, ""]
@@ -53,11 +53,11 @@ class FactorisedMatrix(eqx.Module):
     Attributes:
         matrix: A. Derivatives of any order with respect to its entries exist, forward and reverse.
         factor: LDLᵀ. Derivatives treat the factorisation as a constant.
-        sound: whether a test with random right-hand sides shows that the factorisation is accurate enough. Then its
-            inertia is that of A, and iterative refinement converges. Otherwise results are NaN.
-        error: an estimate of ‖I − AF⁻¹‖ in the Frobenius norm, where F is the computed LDLᵀ. The error of log|det A|
-            and the relative error of A⁻¹ are about as large. The estimate is infinite if pivots were replaced; then
-            log|det A| and A⁻¹ are NaN. Solutions are more accurate, because they are refined.
+        sound: whether the factorisation passes a test with random right-hand sides. If the test is passed, LDLᵀ has the
+            inertia of A, and iterative refinement of solutions converges. If the test fails, results are NaN.
+        error: an estimate of ‖I − AF⁻¹‖ in the Frobenius norm, where F is the computed LDLᵀ. This estimate also holds
+            for the error of log|det A| and the relative error of A⁻¹. If small pivots were replaced, the estimate is
+            infinite, and log|det A| and A⁻¹ are NaN. Solutions are more accurate than A⁻¹, because they are refined.
     """
 
     matrix: PatternedOperator
@@ -75,7 +75,7 @@ class FactorisedMatrix(eqx.Module):
 
     @property
     def inertia(self) -> Inertia:
-        """The numbers of negative and positive eigenvalues; for A = K − σM, of the pencil's eigenvalues < σ and > σ."""
+        """The numbers of negative and positive eigenvalues; if A = K − σM, of pencil eigenvalues below and above σ."""
         negative = self.factor.negative
         counts = negative, jnp.asarray(self.size, negative.dtype) - negative
         return Inertia(*(jnp.where(self.sound, count, -1) for count in counts))
@@ -123,8 +123,8 @@ class FactorisedMatrix(eqx.Module):
         if not is_traced(self.error) and self.sound:
             if jnp.isinf(self.error):
                 raise ValueError(
-                    "matrix: got a nonsingular A, but the elimination begins at a block of A that is singular or "
-                    "nearly so. Solutions are accurate, but the determinant and the inverse are not. Shift A slightly"
+                    "matrix: got a nonsingular A, but the elimination inverts a block that is singular or nearly "
+                    "singular. Solutions are accurate, but the determinant and the inverse are not. Shift A slightly"
                 )
             if self.error > _DOUBTFUL:
                 warn_of_accuracy(
@@ -135,7 +135,7 @@ class FactorisedMatrix(eqx.Module):
 
 
 def _nan_unless(known: Bool[Array, ""], x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Return x if known, otherwise NaN. The product also makes derivatives NaN; `jnp.where` would make them zero."""
+    """Return x if ``known``, otherwise NaN with NaN derivatives; `jnp.where` would make these derivatives zero."""
     return x * jnp.where(known, 1.0, jnp.nan).astype(x.dtype)
 
 
@@ -171,7 +171,7 @@ def certain_factorisation(
 
     none = jnp.zeros((), int)
     if is_traced((pencil, shift, none)):
-        # A loop compiles the factorisation only once.
+        # With `while_loop`, the factorisation is compiled only once for both tries.
         start = jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), jax.eval_shape(attempt, none))
         tries, (arrays, trial) = jax.lax.while_loop(
             lambda s: (s[0] < 2) & ~s[1][1].sound, lambda s: (s[0] + 1, attempt(s[0])), (none, start)
@@ -205,7 +205,7 @@ def _failure(name: str, pencil: SymmetricPencil, factor: Factorisation) -> str:
     many = f"{'at least ' if null.all() and size < pencil.size else ''}{null.sum()}"
     return (
         f"{name}: got a singular matrix with {many} null vector(s), ‖Av‖ ≤ {sizes[null].max():.1e} ‖A‖ ‖v‖. Shift "
-        "the matrix, fix the same number of unknowns, or add a term that is definite on the null space"
+        "the matrix, fix as many unknowns as null vectors, or add a term that is definite on the null space"
     )
 
 
@@ -248,7 +248,7 @@ def _refined(factor: Factorisation, norm: Scalar, product: OfColumns, b: Columns
 
 
 def _eliminated(matrix: Float[Array, " m"], factor: Factorisation) -> Eliminated:
-    """Return the result of `eliminate`; compute it again only if solves use a merged tree."""
+    """Return the result of `eliminate`: from the factors or, if solves use a merged tree, by a second elimination."""
     tree = factor.dissection
     if tree.merged is not None:
         return eliminate(tree, matrix, lambda blocks, _: symmetric_inverses(blocks)[0])
@@ -256,9 +256,9 @@ def _eliminated(matrix: Float[Array, " m"], factor: Factorisation) -> Eliminated
     return [(both[:, :s], both[:, s:]) for s, both in zip(sizes, factor.downward, strict=True)]
 
 
-# Only some entries of d(A⁻¹) = −A⁻¹ dA A⁻¹ are needed. The rule differentiates the elimination and the recurrence from
-# the first separator to the cells; its transpose takes a few times as many operations. The values come from the
-# factors.
+# Only selected entries of d(A⁻¹) = −A⁻¹ dA A⁻¹ are needed. The derivative rule differentiates both steps of selected
+# inversion: the elimination, and the recursion from the first separator to the cells. The transposed rule takes a few
+# times as many operations as the inversion. The values of A⁻¹ come from the factors of A.
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _inverse(diagonal: bool, matrix: Float[Array, " m"], factor: Factorisation) -> Float[Array, " n"]:
     return selected(factor.dissection, _eliminated(matrix, factor), diagonal)
@@ -276,8 +276,8 @@ def _log_of_pivots(matrix: Float[Array, " m"], factor: Factorisation) -> Scalar:
     return jnp.sum(jnp.log(jnp.abs(factor.pivots)))
 
 
-# d log|det A| = tr(A⁻¹ dA) = Σ (A⁻¹)ᵢⱼ dAᵢⱼ needs the inverse where A has entries. All entries of a front's own block
-# are listed. Of the coupling to its boundary and the transposed coupling, only one is listed, and counts twice.
+# The derivative d log|det A| = tr(A⁻¹ dA) = Σ (A⁻¹)ᵢⱼ dAᵢⱼ needs the entries of A⁻¹ on the sparsity pattern of A. The
+# dissection lists only one of two equal entries that couple an own node to a boundary node; this entry counts twice.
 @_log_of_pivots.defjvp
 def _log_of_pivots_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     (matrix, factor), (change, _) = primals, tangents

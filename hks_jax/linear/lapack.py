@@ -1,9 +1,9 @@
 """Decompositions of single small dense matrices. On CPUs `vmap` becomes a loop, because batched LAPACK calls can hang.
 
 jaxlib 0.10.0 to 0.11.0 distribute a batch of LAPACK calls over the CPU's thread pool, and the calling thread waits for
-them (`ParallelBatchMap`). If the calling threads belong to the pool and occupy all of it, no thread does the work. On
-two cores, two independent batched calls in one program hang within a hundred calls. A call on one matrix does not wait.
-So this package calls LAPACK only through this file, matrix by matrix. Then a user's batched call finds free threads.
+them (`ParallelBatchMap`). If waiting threads occupy the whole thread pool, no thread executes the LAPACK calls. On two
+cores, two independent batched calls in one program hang within a hundred calls. A LAPACK call on one matrix does not
+wait. This package calls LAPACK only through this module, matrix by matrix, so that a user's batched calls find threads.
 """
 
 from collections.abc import Callable

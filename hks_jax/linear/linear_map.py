@@ -17,19 +17,19 @@ Derivative = Callable[[Any, Any, Any, Any], Any]
 Tree = TypeVar("Tree")
 
 
-# In reverse mode, JAX replaces a function with a custom rule by its body if the function is linear in an unknown
-# tangent. An outer derivative then differentiates that body. However, JAX does not replace a linear solve. For a linear
-# map F, the system
+# In reverse mode, JAX replaces a function with a custom rule by the function's body if the function is linear in an
+# unknown tangent. An outer derivative then differentiates the body instead of the rule. JAX never replaces a linear
+# solve by its body, so a linear map F is applied by solving a symmetric linear system:
 #
-#     ⎡ 0   I ⎤ ⎡u⎤   ⎡b⎤             ⎡ 0   F ⎤
-#     ⎣ I  −S ⎦ ⎣v⎦ = ⎣c⎦,        S = ⎣ Fᵀ  0 ⎦,
+#     ⎡ 0   I ⎤ ⎡u⎤   ⎡b⎤                  ⎡ 0   F ⎤
+#     ⎣ I  −S ⎦ ⎣v⎦ = ⎣c⎦,    where    S = ⎣ Fᵀ  0 ⎦.
 #
-# is symmetric, and its solution is v = b, u = c + S b. For b = (0, x) and c = 0, u contains F x. JAX differentiates the
-# system, that is, S, which has a custom rule. Since S is symmetric, reverse mode solves the same system.
+# The solution is v = b, u = c + S b; if b = (0, x) and c = 0, the unknown u contains F x. Derivatives of the solution
+# need those of products with S, which have a custom rule. Since S is symmetric, reverse mode solves the same system.
 def linear_map(function: LinearMap, derivative: Derivative, at: Any, constants: Any, x: Any) -> Any:
-    """Return ``function(at, constants, x)``, whose derivative with respect to ``at`` is ``derivative``, in any mode.
+    """Return ``function(at, constants, x)``; its derivative with respect to ``at`` is computed by ``derivative``.
 
-    Derivatives with respect to the constants are zero.
+    Forward and reverse mode can be combined in any order. Derivatives with respect to ``constants`` are zero.
     """
 
     x = jax.tree.map(jnp.asarray, x)  # a user's tangents may be Python numbers
@@ -41,11 +41,11 @@ def linear_map(function: LinearMap, derivative: Derivative, at: Any, constants: 
 def with_transpose(forward: Callable[[Any], Any], backward: Callable[[Any], Any], x: Any, at: Any = ()) -> Any:
     """Return y = ``forward(x)``, linear in x, whose transpose is ``backward``; JAX transposes neither function.
 
-    Both x and y are pytrees of floating point arrays. ``at`` contains the other variables of the two functions;
-    derivatives with respect to ``at`` have custom rules.
+    Both x and y are pytrees of floating-point arrays. ``at`` contains all other variables of ``forward`` and
+    ``backward``; derivatives of these functions with respect to ``at`` have custom rules.
     """
 
-    # JAX transposes a solve only if its whole right-hand side depends on the linearised variables, x or `at`.
+    # JAX transposes a solve only if every part of its right-hand side depends on variables, as these zeros formally do.
     def zeros(like: Any, tree: Any) -> Any:
         empty = [jnp.ravel(leaf)[:0].astype(float) for leaf in jax.tree.leaves(tree)]
         nothing = jnp.sum(jnp.concatenate([jnp.zeros(0), *empty]))
@@ -65,7 +65,7 @@ def with_transpose(forward: Callable[[Any], Any], backward: Callable[[Any], Any]
     y = zeros(jax.eval_shape(forward, x), x)
     right = (y, jax.tree.map(jnp.add, x, zeros(x, x))), (y, zeros(x, x))
     (result, rest), others = jax.lax.custom_linear_solve(system, right, solve, symmetric=True)
-    # JAX differentiates a transposed solve only if its whole right-hand side, the cotangents, depends on variables.
+    # JAX differentiates a transposed solve only if all parts of the solution have cotangents, so the result uses all.
     return jax.tree.map(jnp.add, result, zeros(result, (rest, others)))
 
 
@@ -118,8 +118,8 @@ _MESSAGE = (
 def first_order_only(tree: Tree) -> Tree:
     """Return ``tree`` unchanged; differentiating it raises NotImplementedError.
 
-    The rules for eigenpairs and spectral functions are valid only at eigenpairs. First derivatives do not determine how
-    eigenvectors of a multiple eigenvalue rotate along a path. So differentiating the rules would give wrong numbers,
-    and an error is raised instead.
+    The derivative rules of eigenpairs and spectral functions are valid only at eigenpairs. First derivatives do not
+    determine how eigenvectors rotate within the eigenspace of a multiple eigenvalue. Differentiating the derivative
+    rules would therefore give wrong second derivatives, so that an error is raised instead.
     """
     return not_differentiable(_MESSAGE, tree)

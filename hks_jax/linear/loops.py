@@ -48,7 +48,7 @@ def by_column_ranges(function: Callable[[jax.Array], jax.Array], width: int, x: 
 
 
 def when(condition: Any, function: Callable[[State], State], state: State) -> State:
-    """Return ``function(state)`` if the condition holds, otherwise the state; if traced, by `jax.lax.cond`."""
+    """Return ``function(state)`` if the condition holds, otherwise the state; by `jax.lax.cond` if it is traced."""
     if is_traced(condition):
         return jax.lax.cond(condition, function, lambda state: state, state)
     return function(state) if condition else state
@@ -64,7 +64,7 @@ def one_by_one(function: Callable[..., Any], settings: tuple[Hashable, ...], *ar
     the same object in every call, so that it is compiled once. Settings are static.
     """
     if not is_traced(args):
-        # Without this context, JAX would compile the primal part of a derivative again outside `jit`.
+        # Without `eval_context`, a derivative outside `jit` would compile the undifferentiated function again.
         with contextlib.nullcontext() if is_staged() else jax.core.eval_context():
             return function(*settings, *args)
     # `custom_vmap` supports no static arguments, so that each call defines a rule; its body is compiled only once.
@@ -94,7 +94,7 @@ def _batch(
         whole = [next(remaining) if of_batch else leaf for of_batch, leaf in zip(batched, leaves, strict=True)]
         return call(*jax.tree.unflatten(structure, whole))
 
-    # Nested batches also run in sequence.
+    # The problems of nested batches run in sequence, like those of a single batch.
     alone = partial(problem, partial(one_by_one, function, settings))
     together = jax.vmap(partial(problem, partial(function, *settings)))
     own = [leaf for of_batch, leaf in zip(batched, leaves, strict=True) if of_batch]

@@ -23,8 +23,8 @@ Function = Callable[[Any, Any, Array], Array]
 def matrix_function(A: Any, f: Callable[[Array], Any], B: Any = None) -> Float[Array, "n n"]:
     """Compute f(A) = V f(Λ) Vᵀ of a dense symmetric matrix A = VΛVᵀ, differentiably.
 
-    With B, the result is V f(Λ) Vᵀ = f(B⁻¹A) B⁻¹, where AV = BVΛ and VᵀBV = I. For example, f(λ) = 1 gives B⁻¹,
-    f(λ) = 1/λ gives A⁻¹, and f(λ) = e^(−tλ) gives the heat kernel.
+    If B is given, the result is V f(Λ) Vᵀ = f(B⁻¹A) B⁻¹, where AV = BVΛ and VᵀBV = I. For example, the result is B⁻¹ if
+    f(λ) = 1, A⁻¹ if f(λ) = 1/λ, and the heat kernel if f(λ) = e^(−tλ).
 
     First and second derivatives exist with respect to A, B and the arrays in the closure of f, forward and reverse in
     any order. These derivatives are exact at equal eigenvalues, and accurate at nearly equal ones, because no division
@@ -94,16 +94,18 @@ def _function(f: Function, parameters: Any, others: Any, a: Matrix) -> tuple[Mat
     return _compose(vectors, jnp.diag(f(parameters, others, values))), values, vectors
 
 
-# Let A = VΛVᵀ, and let G = VᵀȦV and H = VᵀÄV for two directions Ȧ and Ä. The derivatives are (Daleckii and Krein 1965)
+# Let A = VΛVᵀ, and let G = VᵀȦV and H = VᵀÄV for two changes Ȧ and Ä of A. The first derivative of f(A) along Ȧ and the
+# second derivative along Ȧ and Ä are (Daleckii and Krein 1965)
 #
 #     ḟ(A) = V ([f]∘G) Vᵀ,    [f]ᵢⱼ = f[λᵢ, λⱼ],
 #     f̈(A) = V S Vᵀ,    Sᵢₖ = Σⱼ f[λᵢ, λⱼ, λₖ] (Gᵢⱼ Hⱼₖ + Hᵢⱼ Gⱼₖ),
 #
-# with divided differences of f, which are smooth at equal eigenvalues. Both formulas are independent of the chosen
-# basis of an eigenspace. But differentiating the first formula term by term would not give the second at a multiple
-# eigenvalue, because Λ and V have no derivatives there. So each formula has its own rule, with eigenpairs as constants.
+# where ∘ is the elementwise product, and the divided differences f[…] are smooth at equal eigenvalues. Neither
+# derivative depends on the chosen basis of an eigenspace. At a multiple eigenvalue, Λ and V have no derivatives, so
+# that differentiating the formula of ḟ(A) term by term would not give f̈(A). First and second derivatives therefore
+# have separate rules, with eigenpairs as constants.
 #
-# If parameters of f also change, let ∂f and ∂'f be the derivatives of f along their two changes. The derivatives are
+# If f has derivatives ∂f and ∂'f along two changes of its parameters, the first and the second derivative of f(A) are
 #
 #     V ([f]∘G + ∂f(Λ)) Vᵀ    and    V (S + [∂f]∘H + [∂'f]∘G + ∂∂'f(Λ)) Vᵀ.
 @_function.defjvp
@@ -120,7 +122,7 @@ _THIRD = "third derivatives of matrix functions are not implemented; only first 
 
 
 def _first(f: Function, at: Any, constants: Any, change: Any) -> Matrix:
-    """Return the derivative of f(A) along a change of (parameters, A)."""
+    """Return the derivative of f(A) along a joint change of A and of the parameters of f."""
     (parameters, _), (others, values, vectors, table) = not_differentiable(_THIRD, at), constants
     d_parameters, d_a = change
     along = _along(f, parameters, others, d_parameters)
@@ -128,7 +130,7 @@ def _first(f: Function, at: Any, constants: Any, change: Any) -> Matrix:
 
 
 def _second(f: Function, at: Any, one: Any, constants: Any, two: Any) -> Matrix:
-    """Return the second derivative of f(A) along two changes of (parameters, A)."""
+    """Return the second derivative of f(A) along two joint changes of A and of the parameters of f."""
     (parameters, _), (others, values, vectors, table) = not_differentiable(_THIRD, at), constants
     (d_one, a_one), (d_two, a_two) = one, two
     g, h = matmul(vectors.T, a_one, vectors), matmul(vectors.T, a_two, vectors)
@@ -144,7 +146,7 @@ def _table(f: Callable[[Array], Array], values: Float[Array, " n"]) -> Matrix:
 
 
 def _table_along(f: Function, parameters: Any, others: Any, values: Float[Array, " n"], change: Any) -> Matrix:
-    """Return [∂f], which is linear in the change: whether `_table` uses a mean or a quotient depends only on f."""
+    """Return the derivative of `_table` along a change of the parameters of f; it is linear in this change."""
     return jax.jvp(lambda p: _table(partial(f, p, others), values), (parameters,), (change,))[1]
 
 

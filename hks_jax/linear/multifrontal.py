@@ -24,7 +24,7 @@ from hks_jax.linear.products import batched_with_columns, gram, matmul
 from hks_jax.linear.symmetric_inverse import symmetric_inverses
 
 CONTRACTION = 0.1
-"""The largest spectral radius of a factorisation's relative error at which its inertia is accepted."""
+"""The largest convergence rate of iterative refinement at which the inertia of a factorisation is accepted."""
 
 Scalar = Float[Array, ""]
 Blocks = tuple[Array, ...]
@@ -32,14 +32,15 @@ Blocks = tuple[Array, ...]
 
 
 class Factorisation(eqx.Module):
-    """K − σM = LDLᵀ.
+    """The multifrontal factorisation K − σM = LDLᵀ.
 
-    A front has an own block A, a coupling B to its boundary, and a block C at the boundary. Its elimination leaves the
-    Schur complement C − BA⁻¹Bᵀ. A stack of factorisations, for several σ, has an additional leading axis.
+    A front consists of the block A of the nodes that it eliminates, the block C of its boundary nodes, and the block B
+    that couples the boundary nodes to the eliminated nodes. Eliminating the block A leaves the Schur complement C −
+    BA⁻¹Bᵀ. If several shifts σ are factorised together, arrays have an additional leading axis.
     """
 
     dissection: Dissection  # the elimination tree
-    # A⁻¹ stacked on BA⁻¹, (fronts, s + r, s), for each level of the (merged) tree
+    # A⁻¹ stacked on BA⁻¹, (fronts, s + r, s), for each level of the tree that solves use
     downward: tuple[Float[Array, "... _fronts _s_plus_r _s"], ...]
     upward: tuple[Float[Array, "... _fronts _s _r"], ...]  # (BA⁻¹)ᵀ, (fronts, s, r)
     # pivots: their product is the determinant, and their signs give the inertia of K − σM; padding has pivots 1
@@ -69,29 +70,30 @@ class Trial(NamedTuple):
     sound: Bool[Array, ""]  # whether the factors have the inertia of K − σM
     # ‖b − (K − σM)x‖/‖b‖ of solutions x for random b, which estimates the convergence rate of iterative refinement
     rate: Scalar
-    # the largest ‖(K − σM)x − b‖/‖Mx‖ of M-orthonormal solutions x. Residuals of eigenpairs near σ cannot be smaller;
-    # measured residuals are 1 to 15 times as large, rarely up to 40 times
+    # the largest ‖(K − σM)x − b‖/‖Mx‖ of M-orthonormal solutions x, a lower bound for the residuals of eigenpairs near
+    # σ; measured residuals are 1 to 15 times as large as this bound, rarely up to 40 times
     error: Scalar
 
 
-# If the shift is an eigenvalue of a part of the domain, a pivot vanishes. A pivot δ causes Schur complements of size
-# 1/δ and, with the explicit inverses of the next front, errors of ε/δ². Replacing δ by the least allowed pivot perturbs
-# the matrix by at most twice that pivot. Both errors balance if the least pivot is near ε^(1/3), which bounds the error
-# of every factorisation (static pivoting, Li and Demmel 1998). In measurements, ε^(3/8) is best for counts. Solves need
-# more accuracy, and small pivots may be harmless, as on a thin domain or with a nearly decoupled component.
+# If the shift is an eigenvalue of a subdomain, a pivot vanishes. A small pivot δ causes Schur complements of size 1/δ
+# and, because the next front is inverted explicitly, rounding errors of ε/δ². Replacing δ by the least allowed pivot
+# changes the matrix by at most twice this pivot. Rounding errors and the change are equal and bounded if the least
+# allowed pivot is near ε^(1/3) (static pivoting, Li and Demmel 1998). In measurements, ε^(3/8) as the least allowed
+# pivot gives the best eigenvalue counts. A first factorisation replaces no pivots, as small pivots may be harmless.
 def factorise(dissection: Dissection, matrix: Float[Array, " m"], least: Scalar | None = None) -> Factorisation:
     """Factorise a symmetric matrix, without pivoting between fronts; `try_out` measures the accuracy.
 
-    The matrix is given by its entries at the places of the pattern, as from `SymmetricPencil.shifted`. Pivots smaller
-    than ``least``, relative to the entries of the front, are replaced by ±``least``.
+    The matrix is given by its entries on the sparsity pattern, as from `SymmetricPencil.shifted`. Pivots smaller than
+    ``least``, relative to the entries of the front, are replaced by ±``least``.
     """
     return Factorisation(dissection, *_eliminate(dissection, matrix, least))
 
 
-# Let the computed LDLᵀ be F = A + E, where A = K − σM. If the spectral radius of EF⁻¹ is below one, then F − tE = (1 −
-# tEF⁻¹)F is nonsingular for all t in [0, 1]. So no eigenvalue crosses zero, and F and A have equal inertia. For x =
-# F⁻¹b, the residual b − Ax equals EF⁻¹b, so that repeated solves with residuals are a power iteration. If the first
-# residual is tiny, one step suffices, as a random b has a component of order 1/√n along every direction.
+# Let A = K − σM be the given matrix, and F = A + E the computed LDLᵀ with the rounding error E. If the spectral radius
+# of EF⁻¹ is below one, then F − tE = (1 − tEF⁻¹)F is nonsingular for all t in [0, 1]. No eigenvalue crosses zero
+# between F (t = 0) and A (t = 1), so that F and A have equal inertia. A solution x = F⁻¹b has the residual b − Ax =
+# EF⁻¹b. Solving again with the residual as right-hand side is a step of power iteration for EF⁻¹. If the first residual
+# is tiny, one step suffices, as a random b has a component of order 1/√n along every direction.
 @jit_quickly()
 def try_out(factor: Factorisation, pencil: SymmetricPencil, shift: Scalar, b: Float[Array, "n_dof b"]) -> Trial:
     """Measure the accuracy of a factorisation with random right-hand sides b."""
@@ -110,7 +112,6 @@ def try_out(factor: Factorisation, pencil: SymmetricPencil, shift: Scalar, b: Fl
         rates = rates.at[turn].set(jnp.linalg.norm(residual) / jnp.linalg.norm(b))
         return turn + 1, rates, jnp.where(turn == 0, _error(x, image, residual), error), residual
 
-    # A loop compiles the solve only once.
     none = jnp.full(2, jnp.inf, b.dtype)
     _, (first, further), error, _ = jax.lax.while_loop(in_doubt, solve, (jnp.zeros((), int), none, none[0], b))
     return Trial((first < tiny) | ((first < CONTRACTION) & (further < CONTRACTION)), first, error)
@@ -148,7 +149,7 @@ def _eliminate(
 
 
 def _merged(levels: tuple[Level, ...], merged: Merged, downward: Blocks, upward: Blocks) -> tuple[Blocks, Blocks]:
-    """Return the matrices of merged levels, by substitution along the levels of each group, applied to the identity."""
+    """Return ``downward`` and ``upward`` of the merged tree, from solves with the identity on the right-hand side."""
     inverses, couplings, first = [], [], 0
     for rows, places in zip(merged.rows, merged.places, strict=True):
         (fronts, s), group = places.shape, slice(first, first + len(rows))
@@ -171,9 +172,9 @@ def eliminate(
 ) -> list[tuple[Inexact[Array, "fronts s s"], Inexact[Array, "fronts r s"]]]:
     """Eliminate a symmetric matrix, real or complex, from the cells up to the first separator.
 
-    ``invert`` maps symmetric blocks (fronts, s, s), and the largest absolute value of each front's entries, to
-    inverses. The result is (A⁻¹, BA⁻¹) for the fronts of each level. Here A is a front's own block and B its coupling
-    to its boundary; both include the Schur complements of the fronts below.
+    The function ``invert`` returns the inverses of symmetric blocks (fronts, s, s), given these blocks and the largest
+    absolute value of each front's entries. The result contains A⁻¹ and BA⁻¹ of the fronts of each level. The block A of
+    eliminated nodes and the block B that couples boundary nodes to them include Schur complements of child fronts.
     """
     start = list(accumulate((math.prod(level.shape) for level in dissection.levels), initial=0))
     needed = matrix if dissection.entries is None else taken(matrix, dissection.entries)
@@ -200,7 +201,7 @@ def eliminate(
 def _substituted(
     levels: tuple[Level, ...], downward: Blocks, upward: Blocks, rhs: Float[Array, "n b"]
 ) -> tuple[Float[Array, "m b"], Float[Array, "fronts r b"]]:
-    """Solve along levels; x = 0 at the boundary of the first. Return x at own nodes, and the boundary residual."""
+    """Return the solution that is zero at the first level's boundary nodes, and its residual at these nodes."""
     width = rhs.shape[1]
     own: list[Array] = []
     passed: Array | None = None
@@ -208,7 +209,7 @@ def _substituted(
         s = level.own.shape[1]
         force, onward = taken(rhs, level.own), jnp.zeros((), rhs.dtype)
         if passed is not None:
-            # Nodes that a child does not have refer to the additional row of zeros.
+            # If a child front does not contain a node, the node's index refers to the appended row of zeros.
             padded = jnp.pad(passed.reshape(-1, width), ((0, 1), (0, 0)))
             total = sum((taken(padded, places) for places in level.children), jnp.zeros((), rhs.dtype))
             force, onward = force + total[:, :s], total[:, s:]
@@ -225,7 +226,7 @@ def _substituted(
 
 
 def taken(x: Inexact[Array, "n *b"], index: Int[ArrayLike, "*m"]) -> Inexact[Array, "*m_and_b"]:
-    """Return rows of x. For indices out of range the rows are arbitrary; callers multiply these by zero."""
+    """Return the indexed rows of x. Indices out of range give arbitrary rows, which callers multiply by zero."""
     return x.at[index].get(mode="clip", wrap_negative_indices=False)
 
 
@@ -236,7 +237,7 @@ def _put(x: Inexact[Array, " n"], index: Int[ArrayLike, " m"], values: Inexact[A
 def gather_symmetric(
     blocks: Inexact[Array, "blocks r r"], index: Int[Array, "children fronts m"]
 ) -> Inexact[Array, "children fronts m m"]:
-    """Return the entries of symmetric blocks at pairs of places (block · r + i, block · r + j); zero for padding."""
+    """Return submatrices of symmetric blocks (r, r), given flat row indices block·r + i; zero for padding."""
     n, r = blocks.shape[:2]
     valid = index < n * r
     # Gathering complete rows, and then columns of these, is faster than gathering single entries.

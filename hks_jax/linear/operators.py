@@ -20,7 +20,7 @@ Places = tuple[np.ndarray, np.ndarray]
 OfColumns = Callable[[Float[Array, "n_dof b"]], Float[Array, "n_dof b"]]
 
 _PLACES = 1 << 12
-"""The number of entries of an outer product that are computed together: their operands fit into the cache."""
+"""The number of entries of Σ pxᵀ that are computed per step; the parts of p and x for a step fit into the cache."""
 _RUN = 8
 """Slices are faster than indices if runs of entries at one distance to the diagonal are longer than this on average."""
 ROUNDING = 1000
@@ -104,7 +104,7 @@ class PatternedOperator(Operator):
 
     @abstractmethod
     def flat(self) -> Float[Array, " m"]:
-        """Return the array of entries that the pattern's places index."""
+        """Return the entries as one array, in the order to which the indices of the pattern refer."""
 
     @abstractmethod
     def with_flat(self, entries: Float[Array, " m"]) -> "PatternedOperator":
@@ -147,8 +147,8 @@ class SparseOperator(PatternedOperator):
     Attributes:
         entries: the entries (m,) in the order of the pattern.
         structure: the pattern; static.
-        table: the pattern's table as arrays, which are arguments of compiled functions. If it is None, the table is a
-            constant, which for a million rows adds seconds to each compilation.
+        table: the pattern's table as arrays, which are arguments of compiled functions. If ``table`` is None, compiled
+            functions contain the table as a constant, which for a million rows adds seconds to each compilation.
     """
 
     entries: Float[Array, " m"]
@@ -249,9 +249,9 @@ def shifted(stiffness: PatternedOperator, mass: Operator, shift: Inexact[Array, 
 def require_symmetric(
     name: str, values: Any, places: Places, size: int, remedy: str, limit: float | None = None
 ) -> None:
-    """Raise ValueError unless a matrix is finite and symmetric. Entries at equal places are added.
+    """Raise ValueError unless a matrix is finite and symmetric. Entries with the same row and column are added.
 
-    The limit of asymmetry is relative to the largest entry; None means the level of rounding.
+    The largest accepted asymmetry is ``limit`` times the largest entry; by default, ``limit`` is `ROUNDING` times ε.
     """
     data, (rows, cols) = np.asarray(values), places
     wrong = int((~np.isfinite(data)).sum())

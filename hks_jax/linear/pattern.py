@@ -13,14 +13,14 @@ from hks_jax.linear.bisection import Parts, bisect_graph
 
 
 class Pattern:
-    """The places where a symmetric matrix may have nonzero entries. Static and hashable."""
+    """The positions at which a symmetric matrix may have nonzero entries. Static and hashable."""
 
     size: int  # the number of rows
     n_entries: int  # the size of the array of entries
 
     @abstractmethod
     def places(self) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
-        """Return for each place its index into the array of entries, its row, and its column."""
+        """For each entry of the pattern, return its index in the array of entries, its row, and its column."""
 
     @abstractmethod
     def diagonal(self) -> Int[np.ndarray, " n"]:
@@ -59,7 +59,7 @@ class SparsePattern(ByKey, Pattern):
         self.rows, self.cols = (each.value for each in places)
 
     def places(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return for each place its index into the array of entries, its row, and its column."""
+        """For each entry of the pattern, return its index in the array of entries, its row, and its column."""
         return np.arange(self.rows.size, dtype=np.int32), self.rows, self.cols
 
     def diagonal(self) -> Int[np.ndarray, " n"]:
@@ -72,7 +72,7 @@ class SparsePattern(ByKey, Pattern):
 
     @cached_property
     def across(self) -> Int[np.ndarray, " m"]:
-        """The index of the transposed entry of each entry."""
+        """For each entry (i, j), the index of the entry (j, i)."""
         return np.lexsort((self.rows, self.cols)).astype(np.int32)
 
     @cached_property
@@ -80,8 +80,8 @@ class SparsePattern(ByKey, Pattern):
         """The pattern as a table, whose width minimises the cost of products even if a few rows are long."""
         counts = np.bincount(self.rows, minlength=self.size)
         start = np.cumsum(counts) - counts
-        longer = np.cumsum(np.bincount(counts)[::-1])[::-1][1:]  # the number of rows with more than 0, 1, … entries
-        left = np.cumsum(longer[::-1])[::-1]  # the number of entries beyond a width of 0, 1, …
+        longer = np.cumsum(np.bincount(counts)[::-1])[::-1][1:]  # longer[w] rows have more than w entries
+        left = np.cumsum(longer[::-1])[::-1]  # left[w] entries do not fit into a table with w slots for each row
         left = np.append(left, 0)
         width = int(np.argmin(np.arange(left.size) * self.size + _SCATTERED * left))
         slot = np.arange(width)[:, None]

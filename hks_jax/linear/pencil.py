@@ -15,8 +15,8 @@ class NullSpace(eqx.Module):
 
     Attributes:
         vectors: a basis (m, n_dof); m may be 0.
-        fixed: whether every perturbation of K annihilates the null space too, as for stiffness matrices of finite
-            elements. Derivatives then omit the corresponding terms, which are only rounding errors.
+        fixed: whether every perturbation of K annihilates the null space too, as for finite-element stiffness matrices.
+            If ``fixed`` is true, derivatives omit the products of perturbations and null vectors.
     """
 
     vectors: Float[Array, "m n_dof"]
@@ -24,12 +24,12 @@ class NullSpace(eqx.Module):
 
 
 class SymmetricPencil(eqx.Module):
-    """The stiffness K and mass M of Kφ = λMφ. Both are symmetric, and M ≻ 0.
+    """The stiffness K and mass M of Kφ = λMφ. The matrices K and M are symmetric, and M ≻ 0.
 
     Attributes:
         stiffness: K; use ``@`` for products, ``.to_scipy()`` and ``.to_dense()`` for conversion.
-        mass: M, an operator like K. Its pattern is contained in K's.
-        null_space: the null space of K ⪰ 0. None means unknown; then K may be indefinite.
+        mass: M, an operator like K. The sparsity pattern of K contains the pattern of M.
+        null_space: the null space of K ⪰ 0. None means that the null space is unknown and K may be indefinite.
     """
 
     stiffness: PatternedOperator
@@ -62,7 +62,7 @@ class SymmetricPencil(eqx.Module):
 
 
 P = TypeVar("P", bound=SymmetricPencil)
-"""The type of pencil that a solver supports: any pencil, pencils of domains, or pencils of grids."""
+"""The type of pencil that a solver supports: any pencil, or pencils assembled on a domain, or on a grid."""
 
 
 def tabulated(pencil: P) -> P:

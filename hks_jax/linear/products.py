@@ -15,24 +15,24 @@ from hks_jax.linear import accelerators
 from hks_jax.linear.linear_map import with_transpose
 
 _MANY, _TERMS = 512, 40
-"""The least number of matrices, and their largest number of columns, for which a CPU sums batched products term by
-term. For other batches, compilation would take longer than the gain."""
+"""On CPUs, batched products are summed term by term if at least ``_MANY`` matrices have at most ``_TERMS`` columns. For
+smaller batches or larger matrices, compiling these sums would take longer than they save."""
 _ROWS, _LARGE = (4, 5, 3, 7, 2), 1 << 18
-"""The numbers of rows of a large array (at least ``_LARGE`` numbers) that are multiplied together in the cache. The
-first divisor of the number of rows is used, because a remainder would be copied."""
+"""If an array has at least ``_LARGE`` entries, groups of its rows are multiplied together in the cache. The size of a
+group is the first number in ``_ROWS`` that divides the number of rows, because remaining rows would be copied."""
 
 
 def products_with_columns(basis: Float[Array, "m n"], columns: Float[Array, "n c"]) -> Float[Array, "m c"]:
     """Return the inner products of the rows of ``basis`` with the columns.
 
-    XLA's CPU kernels for long contractions are many times faster with the large factor on the left. The barrier keeps
-    XLA from exchanging the factors.
+    For long contractions, XLA's CPU kernels are many times faster if the left factor is the larger one. The
+    optimisation barrier keeps XLA from exchanging the factors ``basis`` and ``columns``.
     """
     return jax.lax.optimization_barrier(matmul(basis, columns))
 
 
 def inner_products(basis: Float[Array, "m n"], block: Float[Array, "b n"]) -> Float[Array, "b m"]:
-    """Return the inner products of rows. With this layout (b, m) of the result, later products are fastest."""
+    """Return the inner products (b, m) of the rows of ``block`` with the rows of ``basis``."""
     if len(basis) < len(block):
         return products_with_columns(block, basis.T)  # the larger factor on the left
     return jax.lax.optimization_barrier(products_with_columns(basis, block.T).T)
@@ -52,8 +52,8 @@ def batched_with_columns(matrices: Float[Array, "m i j"], columns: Float[Array, 
     """
     if accelerators.at_hand() or len(matrices) < _MANY or matrices.shape[2] > _TERMS:
         return matmul(matrices, columns)
-    # XLA might fuse the computation of the columns into the loop, and repeat this computation for each row. A condition
-    # prevents fusion; both branches give the same result.
+    # XLA might fuse the computation of ``columns`` into the sum, and repeat this computation for each row of a matrix.
+    # A `cond`, both branches of which give the same result, prevents the fusion.
     return jax.lax.cond(jnp.isfinite(columns[0, 0, 0]), _written_out, matmul, matrices, columns)
 
 
@@ -61,13 +61,13 @@ def _written_out(matrices: Float[Array, "m i j"], columns: Float[Array, "m j b"]
     return reduce(add, (matrices[:, :, j : j + 1] * columns[:, j : j + 1] for j in range(matrices.shape[2])))
 
 
-# The derivative with respect to parameters of the function sums over the rows. Written out row by row, the sum is
-# fused; a reduction would be many times slower on CPUs. The derivative recomputes intermediate results, because storing
-# them would take several arrays of the size of all rows.
+# The derivative with respect to parameters of ``function`` is a sum over the rows. XLA fuses this sum if the rows are
+# written out one by one; as a reduction, the sum would be many times slower on CPUs. `jax.checkpoint` recomputes
+# intermediate results of ``function``, because storing them would take several arrays as large as ``rows``.
 def of_each_row(
     function: Callable[[Float[Array, "*shape"]], Float[Array, "*shape"]], rows: Float[Array, "b *shape"]
 ) -> Float[Array, "b *shape"]:
-    """Apply a linear function to each row."""
+    """Apply a linear function to each row of the array ``rows``."""
 
     @jax.checkpoint
     def of_some(some: Float[Array, "c *shape"]) -> Float[Array, "c *shape"]:
@@ -107,26 +107,26 @@ def aligned(x: Array, like: ArrayLike) -> Array:
 
 
 _OF_MATRIX, _BLOCKS = 64, 8
-"""The least number of rows in a block of a matrix, and the maximal number of blocks; each is compiled separately."""
+"""The least number of rows in a block of a matrix, and the maximal number of blocks, which are compiled separately."""
 _POINTS = 2048
-"""The number of points per step, at which a few hundred vectors fit into the cache."""
+"""The number of points x in a step of `quadratic_forms`; a few hundred vectors at so many points fit into the cache."""
 
 
-# Only the upper triangle of C is used, in blocks of rows from the diagonal on. Entries right of a block's diagonal
-# square count twice. Blocks beyond the last function that matters are omitted. The loop over groups of points is the
-# outermost, so that vectors are read from memory only once.
+# Since C is symmetric, only its upper triangle is used, in blocks of rows. Entries to the right of a block's diagonal
+# square count twice. A block is omitted if no function from its first row on matters for C. The outermost loop runs
+# over groups of points x, so that the values φᵢ(x) are read from memory only once.
 def quadratic_forms(
     matrices: Float[Array, "m k k"], vectors: Float[Array, "k n"], matters: Bool[Array, "m k"]
 ) -> Float[Array, "m n"]:
     """Return Σᵢⱼ Cᵢⱼ φᵢ(x) φⱼ(x) for each matrix C; not differentiable with respect to φ.
 
-    Entries of C for pairs of functions that do not matter for this C may be treated as zero.
+    ``matters`` states for each matrix C which functions φᵢ matter. If neither φᵢ nor φⱼ matters, Cᵢⱼ may count as zero.
     """
     (m, k), n = matters.shape, vectors.shape[1]
     size, width = min(max(_OF_MATRIX, -(-k // _BLOCKS)), k), min(_POINTS, n)
     first, (starts, _) = np.arange(0, k, size), row_blocks(n, width)
     past_last = jnp.max(jnp.where(matters, np.arange(1, k + 1), 0), axis=1)
-    # The matrices sorted by descending number of needed blocks, and the number of matrices that need each block.
+    # Sort the matrices by descending number of blocks that they use, and count the matrices that use each block.
     order, counts = jnp.argsort(-past_last), jnp.sum(past_last[None] > first[:, None], axis=1)
 
     def at_points(number: Array) -> tuple[Array, Float[Array, "k width"]]:

@@ -1,14 +1,14 @@
 """Selected inversion: the entries of the inverse of a sparse symmetric matrix on its sparsity pattern.
 
-The method is that of Takahashi, Fagan and Chin (1973), on the elimination tree. At a front's elimination, let A be its
-own block, B its coupling to its boundary, and C = BA⁻¹. Then the inverse G of the whole matrix satisfies
+The method is that of Takahashi, Fagan and Chin (1973), on the elimination tree. Let A be the block of the nodes that a
+front eliminates, let B be the block that couples the front's boundary nodes to them, and let C = BA⁻¹. The inverse G of
+the whole matrix has blocks G_own at the eliminated nodes, G_b at the boundary nodes, and G_b,own between both:
 
-    G_own = A⁻¹ + Cᵀ G_b C,    G_b,own = −G_b C,
+    G_own = A⁻¹ + Cᵀ G_b C,    G_b,own = −G_b C.
 
-where G_b is the block of G at the boundary. A front's boundary nodes are own or boundary nodes of the front above. So
-the recursion goes from the first separator down to the cells, and each level needs only blocks of the level above. The
-recursion takes about as many operations as the factorisation, O(N^1.5) in 2D and O(N²) in 3D: L. Lin and others,
-SelInv, ACM Trans. Math. Softw. 37 (2011).
+All boundary nodes of a front belong to its parent front. The recursion therefore goes from the first separator down to
+the cells, and each level needs only blocks of G from the level above. The recursion takes about as many operations as
+the factorisation, O(N^1.5) in 2D and O(N²) in 3D (Lin and others, SelInv, ACM TOMS 37, 2011).
 """
 
 import jax
@@ -77,6 +77,6 @@ def _inverses(matrices: Inexact[Array, "m n n"]) -> Inexact[Array, "m n n"]:
 
 @_inverses.defjvp
 def _inverses_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    # d(A⁻¹) = −A⁻¹ dA A⁻¹, so that reverse mode stores only the inverse.
+    # Since d(A⁻¹) = −A⁻¹ dA A⁻¹ contains only A⁻¹ and dA, reverse mode stores only the inverse A⁻¹.
     inverse = _inverses(*primals)
     return inverse, -matmul(inverse, *tangents, inverse)

@@ -21,17 +21,17 @@ rows are swept in about ``_BLOCKS`` blocks."""
 _ROWS = 32
 """The largest size of blocks that are swept row by row."""
 _MANY = 128
-"""If a level has at least this number of fronts, usually all are definite, because the shift is below their spectra."""
+"""Batches of at least this size usually are definite, because the spectra of small subdomains are above the shift."""
 _LARGEST, _SMALLEST = 64, 16
-"""The largest number of rows of a kernel's matrix (4 warps with 32 numbers per thread), and the least after padding."""
+"""The largest number of rows for a kernel (4 warps with 32 numbers per thread), and the smallest padded size."""
 
 
 def symmetric_inverses(matrices: Matrices, least: Pivots | None = None) -> Inverses:
     """Return the inverse of each matrix A, and pivots, whose product is det A and whose signs give the inertia.
 
     Pivots smaller than ``least`` are replaced by ±``least``. Without ``least``, the inverse of a singular matrix is not
-    finite. On CPUs, LAPACK computes Cholesky factors of large batches, which are usually definite, and eigenvalues of
-    small ones. Accelerators use elimination, because eigenvalues and Cholesky factors are slow there.
+    finite. On CPUs, large batches, which are usually definite, are inverted by LAPACK's Cholesky factors, and small
+    batches by eigenvalues. On accelerators, where both methods are slow, all batches are inverted by elimination.
     """
     none = jnp.zeros(len(matrices), matrices.dtype) if least is None else least
     if not accelerators.at_hand():  # avoids tracing unused branches
@@ -66,8 +66,8 @@ def by_cholesky_factors(matrices: Matrices, least: Pivots) -> Inverses:
 def by_eigenvalues(matrices: Matrices, least: Pivots) -> Inverses:
     """Invert small matrices by their eigenvalues, and others by sweeping blocks, which are inverted recursively.
 
-    Large blocks are in turn swept in small blocks, which needs few passes over the matrix. The largest matrices are
-    divided into halves, which takes fewer operations.
+    Large blocks are in turn swept in small blocks, which needs few passes over the matrix. A matrix of more than
+    ``_LARGE`` rows is inverted as a 2 × 2 block matrix instead, which takes fewer operations.
     """
     n = matrices.shape[1]
     if n <= _BLOCK:
@@ -94,8 +94,8 @@ def by_kernels(matrices: Matrices, least: Pivots) -> Inverses:
     if n <= size:
         return invert_in_registers(matrices, least)
     a, pivots = matrices, []
-    # The loop is unrolled, because an iteration of an XLA loop takes three more launches. Because of the barrier, XLA
-    # compiles one kernel for all blocks.
+    # This loop runs in Python, because each iteration of an XLA loop takes three additional launches. Because of the
+    # optimisation barrier, XLA compiles one kernel for all blocks of equal size.
     for start in range(0, n, size):
         at, rows = jax.lax.optimization_barrier(jnp.int32(start)), min(size, n - start)
         inverses, of_block = invert_in_registers(a, least, at, rows)
@@ -124,15 +124,16 @@ def _by_blocks(invert: Callable[[Array, Array], Inverses], size: int, matrices: 
         return _swept(a, rows, inverses, at), jax.lax.dynamic_update_slice_in_dim(pivots, of_block, at, axis=1)
 
     a, pivots = jax.lax.fori_loop(0, whole // size, sweep, (a, jnp.zeros((m, whole), a.dtype)))
-    # Padding rows have pivots 1; larger eigenvalues may take their places. So all these pivots except one are positive.
+    # Each padding row has a pivot 1, but larger pivots may be listed after these pivots. From index n − 1 on, at most
+    # one pivot is not positive, so that the product of these pivots keeps the determinant and the inertia.
     last = jnp.prod(pivots[:, n - 1 :], axis=1, keepdims=True)
     return -a[:, :n, :n], jnp.concatenate([pivots[:, : n - 1], last], axis=1)
 
 
-# Sweeping a block P of A replaces P by −P⁻¹, and the rest by the Schur complement of P. After sweeping all blocks, A
-# has become −A⁻¹. By Sylvester's law of inertia, A has as many negative eigenvalues as negative pivots. Let U be the
-# rows of P with P replaced by −I, and let A₀ be A with zeros in the rows and columns of P. Then the swept matrix is
-# A₀ − UᵀP⁻¹U, which takes two products and one pass over A.
+# Sweeping a diagonal block P of a symmetric matrix A replaces P by −P⁻¹, and replaces the block of the other rows and
+# columns by the Schur complement of P. If all diagonal blocks are swept, the result is −A⁻¹. By Sylvester's law of
+# inertia, A has as many negative eigenvalues as negative pivots. Let U be the rows of A through P with P replaced by
+# −I, and A₀ be A with zeros in the rows and columns of P. The swept matrix A₀ − UᵀP⁻¹U takes two matrix products.
 def _swept(a: Matrices, rows: Float[Array, "m s n"], inverses: Float[Array, "m s s"], at: Int[Array, ""]) -> Matrices:
     """Sweep the block that begins at row ``at``, given its inverse."""
     index, own = jnp.arange(a.shape[1], dtype=at.dtype), at + jnp.arange(rows.shape[1], dtype=at.dtype)
@@ -143,7 +144,6 @@ def _swept(a: Matrices, rows: Float[Array, "m s n"], inverses: Float[Array, "m s
 
 
 def _away_from_zero(pivots: Float[Array, "..."], least: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Replace pivots smaller than ``least`` by ±``least``."""
     return jnp.where(jnp.abs(pivots) < least, jnp.where(pivots < 0, -least, least), pivots)
 
 

@@ -26,17 +26,17 @@ ITEMS: dict[str, Callable[[bool, Echo], Figure | dict[str, str]]] = {
     "figure6": figures.figure6,
     "triangles": triangles.make,
 }
-"""The functions of all items, each of which returns a figure, or texts by file name."""
+"""The function that makes each table or figure; it returns a figure, or a dictionary from file names to texts."""
 
 
 def run(output: Path, full: bool = False, only: list[str] | None = None, echo: Echo = print) -> list[Path]:
-    """Write the paper's table and figures, and a check of a remark, to a directory; return the written files.
+    """Write the paper's table and figures, and counts of violated triangle inequalities; return the files' paths.
 
     Args:
         output: the directory, which is created if necessary.
         full: whether to use the paper's sizes (many minutes) instead of small sizes (a minute or two).
         only: a selection of ``"table1"``, ``"figure1"`` … ``"figure6"``, ``"triangles"``; by default all.
-        echo: a function that is called with a line of text at the start of each step and after each item.
+        echo: a function that receives progress messages, each a line of text.
 
     Raises:
         ValueError: if a name in `only` is unknown.

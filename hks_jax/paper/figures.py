@@ -41,7 +41,8 @@ SIZES: dict[str, tuple] = {
 """The nodes per axis of quick and full runs, and for Figure 1 the number of eigenpairs."""
 TIMES = {"figure1": 1.0, "figure2": 0.01, "figure3": 1.0, "figure4": 0.01, "figure5": 0.25}
 LENGTHS = (5.0, 10.0, 20.0, 40.0)
-"""The distances √(t/s) of heat flow in Figure 6 in mm, where s is the mean diffusivity or its inverse."""
+"""The diffusion lengths of the columns of Figure 6 in mm. For the metric D, the time is the squared length times the
+median diffusivity; for the metric D⁻¹, the time is the squared length divided by the median diffusivity."""
 DRAWN = 200
 """The vertices per axis of the drawn surface in Figure 1."""
 ANGLES = ("0", "π/4", "π/2", "3π/4", "π", "5π/4", "3π/2")
@@ -60,7 +61,7 @@ def figure1(full: bool, echo: Callable[[str], None]) -> Figure:
     """Return Figure 1, in which a surface and its induced metric on the parameter domain have the same HKS."""
     (n, k), time = SIZES["figure1"][full], TIMES["figure1"]
     field, mesh = bumpy_torus_field(n), bumpy_torus_mesh(n)
-    echo(f"{k} eigenpairs of the surface with {n}² vertices, and of its metric")
+    echo(f"{k} eigenpairs of the surface with {n}² vertices, and of its metric on {n}² nodes")
     (on_surface,) = signature(mesh, [time], k)
     (on_domain,) = signature(field, [time], k, boundary="periodic")
     low, high = min(on_surface.min(), on_domain.min()), max(on_surface.max(), on_domain.max())
@@ -84,7 +85,7 @@ def figure1(full: bool, echo: Callable[[str], None]) -> Figure:
         field.tensors[part, part],
     )
     plot.ellipses(ellipses, quarter, every=n // 50, sizes="fit")
-    ellipses.set_title("unit circles of the metric $f^{*}g$ on the middle of $U$")
+    ellipses.set_title("unit circles of the metric $f^{*}g$ in the middle of $U$")
     plot.scalar_image(domain_hks, on_domain, field.grid, vmin=low, vmax=high, colorbar=False)
     domain_hks.set_title("HKS of the metric on $U$")
     domain_hks.add_patch(Rectangle((np.pi / 2,) * 2, np.pi, np.pi, fill=False, color="white", linestyle="--"))
@@ -125,7 +126,7 @@ def figure2(full: bool, echo: Callable[[str], None]) -> Figure:
 
 def _row(panels: np.ndarray, field: TensorField, name: str) -> None:
     grid, time = field.grid, TIMES["figure2"]
-    # Over three diffusion lengths heat decays to exp(−9).
+    # Over three diffusion lengths √t, heat decays to exp(−9).
     wide = reflect(field, round(3 * math.sqrt(time) / grid.spacing[0]))
     before = flat_signature(wide, time)
     images = {
@@ -172,7 +173,9 @@ def figure3(full: bool, echo: Callable[[str], None]) -> Figure:
 def figure4(full: bool, echo: Callable[[str], None]) -> Figure:
     """Return Figure 4, which shows fields of constant eigenvalues and varying eigenvectors, and their HKS."""
     n, time = SIZES["figure4"][full], TIMES["figure4"]
-    strip = 0.28  # heat decays to exp(−strip²/t) = exp(−8); the centres of circles and spirals are beyond the strip
+    # Across the width of the strip, heat decays to exp(−width²/t) = exp(−8). The strip does not reach the singular
+    # centres of the fields of circles and spirals.
+    strip = 0.28
     fields = figure4_fields(n)
     fig = plot.new_figure(3.6 * len(fields) + 0.6, 7.2)
     tops, bottoms = fig.subplots(2, len(fields), sharex=True, sharey=True)
@@ -194,7 +197,7 @@ def figure4(full: bool, echo: Callable[[str], None]) -> Figure:
 def figure5(full: bool, echo: Callable[[str], None]) -> Figure:
     """Return Figure 5, which shows the HKS around isolated degenerate points of index −2 to 3."""
     n, time = SIZES["figure5"][full], TIMES["figure5"]
-    strip = 0.7  # at least 1.6 in metric length, where heat decays to at most exp(−1.6²/t)
+    strip = 0.7  # the strip has a metric width of at least 1.6, across which heat decays to exp(−1.6²/t) or less
     fields, images = [degenerate_point_field(float(index), n) for index in INDICES], []
     for index, field in zip(INDICES, fields, strict=True):
         echo(f"index {index}, {n}² nodes")
@@ -246,7 +249,7 @@ def figure6(full: bool, echo: Callable[[str], None]) -> Figure:
         echo(f"{name}, {label}, {int(grid.inside.sum())} nodes, {k} eigenpairs")
         values = signature(field, times, k)
         for ax, image, t, length in zip(row[1:], values, times, LENGTHS, strict=True):
-            # The Neumann boundary raises the HKS near it up to fourfold, so values away from it determine the colours.
+            # The Neumann boundary raises the HKS up to fourfold, so values away from this boundary set the colours.
             tissue = depth > min(2 * length, 0.3 * depth.max())
             low, high = np.quantile(image[tissue], (0.01, 0.99)).tolist()
             plot.scalar_image(ax, image, grid, cmap=colours, vmin=low, vmax=high, orientation=orientation)

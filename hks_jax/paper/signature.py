@@ -30,7 +30,7 @@ def signature(
 ) -> Float[np.ndarray, "n_times *shape"]:
     """Return the HKS from k eigenpairs at the given times."""
     with warnings.catch_warnings():
-        # These domains are symmetric, so k often cuts a multiple eigenvalue. The last pairs are negligible here.
+        # The paper's domains are symmetric, so k often splits a multiple eigenvalue, whose effect is negligible.
         warnings.filterwarnings("ignore", "k = .* cuts a multiple eigenvalue", AccuracyWarning)
         pairs = eigenpairs(domain, k, boundary)
     return np.asarray(hks(pairs, np.asarray(times), normalisation))
@@ -39,7 +39,7 @@ def signature(
 def enough_pairs(field: TensorField, time: float, boundary: str = "neumann", exponent: float = 8.0) -> int:
     """Return k such that exp(−λₖt) is about exp(−exponent), by Weyl's law for a square.
 
-    For the boundary condition "mirror", the mirrored square has four times the area and no boundary.
+    For the boundary condition "mirror", the square is doubled along both axes to a torus of four times the area.
     """
     density = np.sqrt(np.linalg.det(np.asarray(field.domain_tensors)))
     area = float(np.sum(density[field.grid.inside]) * np.prod(field.grid.spacing))
@@ -63,8 +63,8 @@ def flat_signature(
 def continued_signature(field: TensorField, time: float, distance: float) -> Float[np.ndarray, "*shape"]:
     """Return 4πt·HKS of a metric that is given by a function, without the effect of its boundary.
 
-    The grid is extended by a strip of the given width in coordinates, on which the function is evaluated. The effect of
-    the new boundary is confined to the strip, which is then removed.
+    The HKS is computed on a grid that is extended by a strip of width `distance` in coordinates, and is cropped to the
+    field's grid. The boundary of the extended grid affects only the strip.
     """
     grid = field.grid
     width = math.ceil(distance / min(grid.spacing))

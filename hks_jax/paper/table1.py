@@ -37,7 +37,7 @@ class Row(NamedTuple):
 
 
 def make(full: bool, echo: Callable[[str], None]) -> dict[str, str]:
-    """Return the table as Markdown and as comma-separated values by file name."""
+    """Return a dictionary from file names to Table 1 in Markdown and as comma-separated values."""
     k = REFERENCE_PAIRS if full else QUICK_PAIRS
     if full:
         echo(f"{REFERENCE_PAIRS} eigenpairs of the surface with {REFERENCE_SIZE}² vertices")
@@ -64,7 +64,7 @@ def row(n: int, k: int, reference: Float[np.ndarray, "m m"]) -> Row:
 def relative_difference(
     values: Float[np.ndarray, "*shape"], reference: Float[np.ndarray, "*shape"], weights: Float[np.ndarray, "*shape"]
 ) -> float:
-    """Return √(Σ w (values − reference)² / Σ w reference²)."""
+    """Return the relative L² difference √(Σ w (values − reference)² / Σ w reference²) for the weights w."""
     return math.sqrt(np.sum(weights * (values - reference) ** 2) / np.sum(weights * reference**2))
 
 
@@ -80,7 +80,7 @@ def interpolate_periodic(values: Float[np.ndarray, "n n"], factor: int) -> Float
 
 
 def computed_reference(k: int = REFERENCE_PAIRS) -> Float[np.ndarray, "400 400"]:
-    """Compute the HKS of the triangulated surface at the nodes of the 400² grid, which takes minutes."""
+    """Compute the HKS of the bumpy torus as a surface of 400² vertices, which takes minutes."""
     (values,) = signature(bumpy_torus_mesh(REFERENCE_SIZE), [TIME], k)
     return values.reshape(REFERENCE_SIZE, REFERENCE_SIZE)
 
@@ -93,13 +93,13 @@ def stored_reference() -> Float[np.ndarray, "400 400"]:
 
 
 def store_reference(values: Float[np.ndarray, "400 400"], path: Path) -> None:
-    """Write one tenth of the symmetric reference as float32: ``store_reference(computed_reference(), path)``."""
+    """Write one of the ten equal periods of the result of `computed_reference` to a file in float32."""
     np.save(path, values[: REFERENCE_SIZE // SYMMETRY].astype(np.float32))
 
 
 def markdown(rows: list[Row], computed: bool) -> str:
-    """Return the table with its conventions, as Markdown."""
-    origin = "computed in this run" if computed else "read from the package; a full run computes it"
+    """Return Table 1 in Markdown, with explanations of its columns."""
+    origin = "computed in this run" if computed else "read from the package; a full run computes the surface's HKS"
     lines = [
         "# Table 1: HKS of a bumpy torus at t = 1, metric against surface",
         "",
@@ -118,7 +118,7 @@ def markdown(rows: list[Row], computed: bool) -> str:
         "- *the paper*: as printed by Zobel, Reininghaus and Hotz, who do not state their norm or interpolation.",
         "- *independent*: the same method implemented with SciPy only, in the nodal norm.",
         "- *nodal*: √(Σ (h − r)² / Σ r²) over the vertices, with h from the metric and r from the surface.",
-        "  This is the number to compare with the first two columns.",
+        "  Compare the column *nodal* with the columns *the paper* and *independent*.",
         "- *area-weighted*: the same norm with the area element √|T| as weight, which is an integral over the surface.",
         "",
         f"The surface's HKS was {origin}.",

@@ -1,6 +1,6 @@
-"""Violations of the triangle inequality by edge lengths in the metric, a remark of the paper.
+"""A check of the paper's remark that edge lengths in the metric violate the triangle inequality.
 
-The remark concerns discrete exterior calculus. Diagonals cut the cells of a grid into triangles.
+Discrete exterior calculus needs the triangle inequality. Diagonals cut the cells of a grid into triangles.
 """
 
 from collections.abc import Callable
@@ -42,12 +42,12 @@ LENGTHS: dict[str, Callable[[Tensors, Tensors, Vectors], Float[np.ndarray, " n"]
 
 
 class Count(NamedTuple):
-    """The faults of the edge lengths of a triangulated grid."""
+    """The violations of the triangle inequality by the edge lengths of a triangulated grid."""
 
     triangles: int  # the number of triangles
     violating: int  # the triangles with a side longer than the sum of the other two
     vertices: int  # the number of vertices
-    no_area: int  # the vertices whose circumcentric dual cell, without violating triangles, has no positive area
+    no_area: int  # the vertices with a circumcentric dual cell of area ≤ 0; violating triangles do not contribute area
 
 
 def count(field: TensorField, rule: str, periodic: bool = False) -> Count:
@@ -62,7 +62,8 @@ def count(field: TensorField, rule: str, periodic: bool = False) -> Count:
     violating = 2 * lengths.max(axis=1) > lengths.sum(axis=1)
     squared, half = lengths[~violating] ** 2, lengths[~violating].sum(axis=1, keepdims=True) / 2
     area = np.sqrt(half[:, 0] * np.prod(half - lengths[~violating], axis=1))
-    # A triangle adds (b² cot B + c² cot C)/8 to the dual cell of its corner A, where cot A = (b² + c² − a²)/4·area.
+    # A triangle with the sides a, b, c opposite to the corners A, B, C contributes the area (b² cot B + c² cot C)/8 to
+    # the dual cell of the corner A, where cot A = (b² + c² − a²)/(4·area).
     weighted = squared * (squared.sum(axis=1, keepdims=True) - 2 * squared) / (4 * area[:, None])
     cells = np.zeros(len(tensors))
     np.add.at(cells, faces[~violating], (weighted.sum(axis=1, keepdims=True) - weighted) / 8)
@@ -97,13 +98,13 @@ def fields(full: bool) -> list[tuple[str, TensorField, bool]]:
 
 
 def make(full: bool, echo: Callable[[str], None]) -> dict[str, str]:
-    """Return a table in Markdown by its file name."""
+    """Return a dictionary from the file name to the table of violations in Markdown."""
     echo("edge lengths in the metric, on the paper's fields")
     lines = [
         "# Edge lengths in the metric, and the triangle inequality",
         "",
-        "The table counts triangles that violate the inequality, for each rule of edge lengths, and vertices whose",
-        "circumcentric dual cell has no positive area (with midpoint lengths).",
+        "For each rule of edge lengths, the table counts the triangles that violate the triangle inequality.",
+        "The last column counts the vertices whose circumcentric dual cell has no positive area for midpoint lengths.",
         "",
         f"| field | triangles | {' | '.join(LENGTHS)} | vertices | without area |",
         "| --- |" + " ---: |" * (len(LENGTHS) + 3),

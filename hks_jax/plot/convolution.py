@@ -19,7 +19,7 @@ PIXELS_PER_INCH = 110
 """The texture's resolution, at which single grains are visible in print and on screens."""
 
 FRAME = 3
-"""The width in pixels of the border around the arrays of pixels; it exceeds the length of a step."""
+"""The width in pixels of the border around the texture, which exceeds the length of an integration step."""
 
 
 def lic_texture(
@@ -27,15 +27,15 @@ def lic_texture(
 ) -> Float[np.ndarray, "px py"]:
     """Return white noise averaged along the integral lines of an eigenvector field (Cabral and Leedom 1993).
 
-    An eigenvector has no sign, so each step takes the sign that continues the line. The average has bell-shaped
-    weights. The average is divided by its standard deviation and mapped by the normal distribution function to uniform
-    numbers in (0, 1). So the contrast is the same where lines end, at degenerate points and boundaries.
+    Eigenvectors have no sign, so each integration step chooses the sign that prevents a reversal of the line. The
+    weights of the average are bell-shaped. The averaged noise is divided by its standard deviation and mapped by the
+    normal distribution function to uniform numbers in (0, 1), so that the contrast is the same where lines end.
 
     Args:
         field: a 2D field.
         which: ``"major"``, the eigenvector of the larger eigenvalue of T, or ``"minor"``.
         pixels: the number of pixels along the longer side of the grid.
-        length: the length of the average on each side of a pixel, forwards and backwards, in pixels.
+        length: the number of pixels along which noise is averaged in each direction of a line.
         seed: the seed of the noise.
 
     Returns:
@@ -43,7 +43,7 @@ def lic_texture(
         outside the mask. Where eigenvalues are equal the noise is not averaged.
 
     Raises:
-        ValueError: if the field is 3D, `which` is unknown, there are fewer than 2 pixels, or the length is below 1.
+        ValueError: if the field is 3D, `which` is unknown, `pixels` is less than 2, or `length` is less than 1.
 
     Examples:
         >>> texture = hj.plot.lic_texture(field, pixels=64)
@@ -60,8 +60,8 @@ def lic_texture(
     centres = np.moveaxis(np.indices(shape), 0, -1).reshape(-1, 2) + 0.5
     points = [x0, y0] + centres * size
     noise = np.random.default_rng(seed).standard_normal(shape).astype(np.float32)
-    # For steps of one pixel the direction at every pixel suffices. Complex numbers represent vectors, and a border of
-    # NaN ends lines that leave the image. Explicit tests for the image's sides would take most of the time.
+    # For integration steps of one pixel, the direction at every pixel suffices. Complex numbers represent vectors. A
+    # border of NaN ends lines that leave the image, because bounds checks would take most of the run time.
     along = _complex(direction(points) / size * side).reshape(shape)
     along, values = np.pad(along, FRAME, constant_values=np.nan), np.pad(noise, FRAME)
     total, squares = noise.ravel().copy(), np.ones(noise.size, np.float32)
@@ -105,7 +105,7 @@ def line_integral_convolution(
         which: ``"major"`` or ``"minor"``.
         values: (*shape,) a scalar such as the HKS, drawn by `scalar_image`; by default the image on `ax`, or grey.
         contrast: the maximum opacity of black and white, in (0, 1].
-        pixels: the texture's pixels along the longer side. The default is about 110 per inch of the axes.
+        pixels: the number of pixels along the texture's longer side, by default about 110 per inch of the axes.
         length: the same as for `lic_texture`.
         **kwargs: arguments of `scalar_image` for `values`.
 
@@ -133,7 +133,8 @@ def line_integral_convolution(
     shift = contrast * (2 * texture.T - 1)
     shade = np.zeros((*shift.shape, 4))
     if ax.images:
-        # Black of opacity p multiplies a colour by 1 − p. White multiplies the colour's distance to white by 1 − p.
+        # A black pixel of opacity p multiplies the colour below by 1 − p. A white pixel of opacity p multiplies the
+        # distance of the colour below to white by 1 − p.
         shade[..., :3] = (shift > 0)[..., None]
         shade[..., 3] = np.abs(shift)
     else:

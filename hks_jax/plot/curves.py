@@ -11,13 +11,14 @@ from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.weyl import weyl_count
-from hks_jax.plot.figure import SMALL
+from hks_jax.plot.figure import SMALL, number_text
 from hks_jax.plot.panels import checked_times
 
 
@@ -36,7 +37,7 @@ def hks_curves(
     cmap: str = "viridis",
     **kwargs: Any,
 ) -> list[Line2D]:
-    """Draw HKS(t) at the nodes nearest to `points`, with the expansion as dashed lines in the same colours.
+    """Draw the HKS over t at the nodes nearest to `points`, with its short-time expansion as dashed lines if given.
 
     Args:
         ax: the axes to draw on.
@@ -45,7 +46,7 @@ def hks_curves(
         grid: the grid of the values, 2D or 3D.
         points: (n, d) coordinates, one row for each curve.
         expansion: (n_times, *shape) the result of `hks_jax.hks_expansion`.
-        limit: the least resolved time, `hks_jax.truncation(pairs, times).smallest_time`, below which times are shaded.
+        limit: the smallest resolved time, `hks_jax.truncation(pairs, times).smallest_time`; smaller times are shaded.
         labels: a label for each point, by default its coordinates.
         unit: the unit of t.
         scaled: whether to draw (4πt)^(d/2)·HKS, which is 1 for flat space without boundary, on a linear scale.
@@ -70,10 +71,13 @@ def hks_curves(
     factor = (4 * math.pi * t) ** (grid.dimension / 2) if scaled else np.ones_like(t)
     colours = colormaps[cmap](np.linspace(0.0, 0.85, len(nodes)))
     ax.set(xscale="log", yscale="linear" if scaled else "log")
+    if t.max() < 100 * t.min():  # by default, Matplotlib labels so many ticks that the labels overlap
+        ax.xaxis.set(major_locator=LogLocator(subs=(1, 2, 5)), minor_formatter=NullFormatter())
+        ax.xaxis.set_major_formatter(lambda value, _: number_text(value))
     lines = []
     for node, label, colour in zip(nodes, labels, colours, strict=True):
         lines += ax.plot(t, factor * curves[node], **{"color": colour, "label": label, **kwargs})
-    limits = ax.get_ylim()  # without the expansion, because it diverges at large t
+    limits = ax.get_ylim()  # the expansion diverges at large t, so it does not set the limits
     if series is not None:
         for node, line in zip(nodes, lines, strict=True):
             ax.plot(t, factor * series[node], color=line.get_color(), linestyle="--", linewidth=1.0)
@@ -116,16 +120,16 @@ def spectrum(
 
     Args:
         ax: the axes to draw on.
-        pairs: the result of `eigenpairs`; pairs that are not kept are omitted.
-        domain: the field or mesh of the pairs, for the second term of the law, which belongs to the boundary. Without a
-            domain only the first term is drawn.
-        remainder: whether to draw N(λ) minus the law. This difference has no trend, but falls if eigenvalues are
-            missing, or are too large on a coarse grid.
+        pairs: the result of `eigenpairs`; eigenpairs with ``pairs.kept`` False are omitted.
+        domain: the field or mesh of the eigenpairs, which determines the boundary term of Weyl's law. Without a domain,
+            Weyl's law is drawn without its boundary term.
+        remainder: whether to draw N(λ) minus Weyl's law. A falling difference shows that eigenvalues are missing, or
+            that a coarse grid overestimates eigenvalues.
         unit: the unit of λ.
-        **kwargs: arguments of `Axes.plot` for N.
+        **kwargs: arguments of `Axes.plot` for the line of N(λ).
 
     Returns:
-        The lines of N, of the law with the boundary term if `domain` is given, and of the law's first term.
+        The curves of N(λ), of Weyl's law with both terms (if `domain` is given), and of its first term alone.
 
     Raises:
         ValueError: if the pairs do not belong to the domain.
@@ -136,7 +140,7 @@ def spectrum(
         12.0
     """
     values = np.asarray(pairs.eigenvalues, np.float64)[np.asarray(pairs.kept)]
-    # Each step is drawn from its lower to its upper end.
+    # The staircase N(λ) has a vertical segment at each eigenvalue.
     steps = np.repeat(values, 2)
     count = np.repeat(np.arange(values.size + 1.0), 2)[1:-1]
     fine = np.linspace(0, values[-1], 400)

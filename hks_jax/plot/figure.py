@@ -83,7 +83,7 @@ def cell_extent(grid: Grid) -> tuple[float, float, float, float]:
 
 
 def panel_size(grid: Grid, side: float, steepest: float = 4.0) -> tuple[float, float]:
-    """Return an image's width, at most `side`, and height; the larger is at most `steepest` times the smaller."""
+    """Return an image's width of at most `side`, and its height, with an aspect ratio of at most `steepest`."""
     x0, x1, y0, y1 = cell_extent(grid)
     aspect = min(max((y1 - y0) / (x1 - x0), 1 / steepest), steepest)
     width = side / max(1.0, aspect**0.5)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:  # slow to import
     from hks_jax.inverse.metric_fit import MetricFit
 
 LEAST_DIFFERENCE = 1e-6
-"""The least range of the colours of relative differences; differences due to errors of eigenpairs are smaller."""
+"""The relative difference of the last colour is at least 1e-6, so errors of eigenpairs are not visible."""
 
 
 def fit_panels(
@@ -38,8 +38,8 @@ def fit_panels(
     """Return a figure of a fit in 2D with signatures, the metric and the loss.
 
     Each of a few times, including the first and the last, has a row with the target, the fitted signature in the same
-    colours, and their relative difference in colours that all rows share. Below are the unit circles of the fitted
-    metric and the loss over the steps, with a curve for each start.
+    colours, and their relative difference in colours that all rows share. The figure's last row has the unit circles of
+    the fitted metric, and the loss over the steps with a curve for each initial guess.
 
     Args:
         fit: the result of `hks_jax.fit_metric`.
@@ -76,10 +76,10 @@ def fit_panels(
     if orientation is not None:
         field = TensorField(orientation.grid(grid), orientation.tensors(field.tensors), field.interpolation)
     width, height = panel_size(field.grid, 2.5)
-    # The lowest row has at least the height that the curves need.
+    # The last row is at least 1.8 inches high, because it also contains the plot of the loss.
     heights = [height] * len(rows) + [max(height, 1.8)]
     figure = new_figure(3 * (width + 0.9) + 0.4, sum(heights) + 0.3 * len(heights) + 0.6 + 0.3 * bool(title))
-    # Separate grids prevent the labels of the last row from widening the columns above.
+    # With a separate layout grid, the labels of the last row do not widen the columns of the other rows.
     halves = figure.add_gridspec(2, 1, height_ratios=[sum(heights[:-1]), heights[-1]])
     panels, last = halves[0].subgridspec(len(rows), 3), halves[1].subgridspec(1, 2, width_ratios=(1, 1.7))
     symbol = fit.problem.observation.signature.symbol or "t"
@@ -105,7 +105,6 @@ def fit_panels(
 
 
 def _draw_loss(ax: Axes, fit: "MetricFit") -> None:
-    """Draw the loss over the steps of each start and, if there are penalties, the data's part of the loss."""
     starts = sorted({step.start for step in fit.history})
     for color, start in zip(itertools.cycle(TABLEAU_COLORS), starts, strict=False):
         steps = [step for step in fit.history if step.start == start]

@@ -76,7 +76,7 @@ def ellipses(
     half_axes = eigenvalues**power
     longer = 0 if kind == "metric" else 1
     axis = vectors[:, :, longer]
-    # The bounding box of the ellipse has the half widths √((T^±1)_aa).
+    # Along axis a, the half width of an ellipse's bounding box is √((T⁻¹)_aa) for a metric and √(T_aa) for a tensor.
     box = np.sqrt(np.einsum("nai,ni->na", vectors**2, half_axes**2))
     scale = 0.5 * FILL / np.max(box / (np.array(steps) * grid.spacing), axis=1)
     if sizes == "common":
@@ -111,9 +111,9 @@ def ellipses(
 
 
 def nodes_drawn(grid: Grid, every: int | Sequence[int] | None, ax: Axes) -> tuple[tuple[int, ...], tuple[slice, ...]]:
-    """Return the step along each axis and the centred slices of the drawn nodes.
+    """Return the step along each axis, and the slices that select the drawn nodes.
 
-    By default the longer side has about 10 nodes per inch and at most 24.
+    By default, about 10 nodes per inch and at most 24 nodes are drawn along the longer side.
     """
     if every is None:
         width, height = (n * h for n, h in zip(grid.shape, grid.spacing, strict=True))
@@ -122,7 +122,7 @@ def nodes_drawn(grid: Grid, every: int | Sequence[int] | None, ax: Axes) -> tupl
     else:
         given = np.broadcast_to(np.asarray(every), (grid.dimension,))
         if not np.issubdtype(given.dtype, np.integer) or given.min() < 1:
-            raise ValueError(f"every: got {every}; expected one positive integer or {grid.dimension}")
+            raise ValueError(f"every: got {every}; expected one positive integer, or one for each axis")
         steps = tuple(given.tolist())
     counts = [max(1, n // step) for n, step in zip(grid.shape, steps, strict=True)]
     firsts = [(n - m * s) // 2 + s // 2 for n, m, s in zip(grid.shape, counts, steps, strict=True)]
@@ -140,10 +140,10 @@ def sensitivity(
     legend: bool = True,
     **kwargs: Any,
 ) -> LineCollection:
-    """Draw the derivative of a number with respect to the tensors at each node as a cross.
+    """Draw the derivative of a scalar quantity with respect to the tensor at each node as a cross.
 
-    A cross has two bars along the eigenvectors of the gradient, and the length of a bar is |μ|^power for the eigenvalue
-    μ. A bar has the first colour if the number grows with the metric's length along the bar, otherwise the second.
+    A cross has two bars along the eigenvectors of the gradient, whose lengths are proportional to |μ|^power for the
+    eigenvalues μ. If the eigenvalue is positive, the scalar quantity increases with the metric's length along the bar.
 
     Args:
         ax: the axes to draw on.
@@ -203,7 +203,7 @@ def degenerate_points(
     """Mark the degenerate points of a 2D field on `ax` with shapes and colours that depend on their index.
 
     Trisectors (index −½) are triangles, wedges (½) are discs, and other points are polygons with |2·index| + 2 sides.
-    The sizes are in coordinates, and are reduced where marks would overlap.
+    The sizes of marks are in coordinate units, and are reduced where marks would overlap.
 
     Args:
         ax: the axes to draw on.
@@ -215,7 +215,7 @@ def degenerate_points(
         **kwargs: arguments of `matplotlib.collections.PolyCollection`.
 
     Raises:
-        ValueError: if the field is 3D, merge is less than 1, or the size is not positive.
+        ValueError: if the field is 3D, `merge` is less than 1, or `size` is not positive.
 
     Examples:
         >>> wedge = hj.examples.degenerate_point_field(0.5, 9)

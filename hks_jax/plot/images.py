@@ -15,9 +15,9 @@ from hks_jax.plot.figure import cell_extent, colour_bar, frame, require_plane
 from hks_jax.plot.orientation import Orientation
 
 FADED = 2.0
-"""The number of standard deviations above which values are not faded as noise."""
+"""The number of standard deviations from the null value above which values are not faded as noise."""
 FAR = 1.5
-"""The ratio of the median of the values to the centre above which the colours have no centre."""
+"""If the median of nonnegative values exceeds 1.5 times the centre, the colour range is not centred."""
 RULES = ("quantiles", "least_range", "centre", "vmin", "vmax")
 """The arguments of `scalar_image` that determine the values of the first and the last colour."""
 
@@ -49,17 +49,17 @@ def scalar_image(
         vmin: the value of the first colour, by default from `quantiles`.
         vmax: the value of the last colour, by default from `quantiles`.
         centre: the value of the middle colour unless vmin and vmax are given, such as 1, the value of 4πt·HKS for a
-            flat metric. The colours reach equally far above and below the centre, but not below 0 if all values are
-            ≥ 0. The centre is ignored if all values are ≥ 0 and most values are far above the centre.
+            flat metric. The colour range is symmetric about the centre, but does not extend below 0 if no value is
+            negative. The argument `centre` is ignored if no value is negative and most values are far above the centre.
         quantiles: the quantiles of the values that get the first and the last colour, unless vmin and vmax are given.
             The colour bar has arrows if other values lie beyond its ends.
         least_range: the least difference between the values of the first and the last colour, relative to the larger
-            value. A larger range prevents colours from showing rounding or discretisation errors of a constant.
+            value. A larger `least_range` hides rounding or discretisation errors of nearly constant values.
         colorbar: whether to add a colour bar.
         label: the colour bar's label.
-        orientation: the orientation of the grid in space, which turns the image and adds space coordinates and letters.
+        orientation: the grid's orientation in space, by which the image is turned and its sides are labelled (L, R, …).
         z: (*shape,) the distance of the values from a null value in standard deviations of noise
-            (`hks_jax.Uncertainty.z`). Values fade to grey as |z| decreases from `FADED` to 0.
+            (`hks_jax.Uncertainty.z`). Values within two standard deviations of the null value fade to grey.
         **kwargs: arguments of `Axes.imshow`.
 
     Raises:
@@ -186,10 +186,10 @@ def panel_colours(
     shared: bool = False,
     **kwargs: Any,
 ) -> list[dict[str, Any]]:
-    """Return the arguments of `scalar_image` for each image, given the arguments for all images.
+    """Return the arguments of `scalar_image` for each image; `kwargs` are the arguments that all images share.
 
-    The values of the first and the last colour of each image are its `limits`. Without limits, they follow from the
-    values of the image or, if `shared` is set, from the values of all images.
+    The values of the first and the last colour of each image are its `limits`. Without `limits`, the colour range
+    follows from the values of the image or, if `shared` is True, from the values of all images.
     """
     rules = {name: kwargs.pop(name) for name in RULES if name in kwargs}
     if limits is not None:

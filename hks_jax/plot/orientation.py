@@ -20,14 +20,14 @@ LETTERS = ("LR", "PA", "IS")
 class Orientation(NamedTuple):
     """The directions of an array's axes in space, which determine how its image is turned.
 
-    The image does not depend on the storage order of the voxels. The horizontal axis of the image precedes its vertical
-    axis in the order left–right, back–front, foot–head. Letters at the edges of the image name the directions. The
-    radiological view is mirrored.
+    The image does not depend on the storage order of the voxels. The axis left–right is horizontal, and the axis
+    foot–head is vertical. The axis back–front is vertical in axial slices and horizontal in sagittal slices. Letters at
+    the edges of the image name the directions. The radiological view is mirrored.
 
     Attributes:
         axes: the array's axis for each axis of the image.
-        turned: whether the array's axis has the opposite direction, for each axis of the image.
-        ends: the letters of the low and the high end, for each axis of the image.
+        turned: whether each axis of the image is a reversed axis of the array.
+        ends: the letters of the low and the high end of each axis of the image, such as ``"LR"``.
         origin: the coordinate of the array's first node, for each axis of the image. The coordinates are space
             coordinates for voxels along the axes of space, and coordinates along the voxel axes for oblique voxels.
         view: ``"neurological"`` (left is on the left) or ``"radiological"`` (left is on the right).
@@ -67,7 +67,7 @@ class Orientation(NamedTuple):
         steps = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)
 
         def nearness(order: tuple[int, ...]) -> tuple[float, ...]:
-            """Return the closeness of the axes to the axes of space and, to break ties, their directions."""
+            """Return the sum of cosines between array axes and space axes and, to break ties, all cosines."""
             cosines = np.diag(steps[:, order])
             return tuple(np.round([np.abs(cosines).sum(), *(steps[:, order] * np.sign(cosines)).ravel()], 6).tolist())
 
@@ -84,7 +84,7 @@ class Orientation(NamedTuple):
         )
 
     def grid(self, grid: Grid) -> Grid:
-        """Return the grid of the image for the grid of the array."""
+        """Return the array's grid, with its axes in the order and direction of the image's axes."""
         if grid.dimension != len(self.axes):
             raise ValueError(f"orientation: got {len(self.axes)} axes; expected {grid.dimension}, as for the grid")
         spacing = np.take(grid.spacing, self.axes)
@@ -94,25 +94,25 @@ class Orientation(NamedTuple):
         return Grid(np.take(grid.shape, self.axes).tolist(), spacing.tolist(), origin.tolist(), mask, "all")
 
     def array(self, values: Any) -> Any:
-        """Return an array (*shape,) or (n_times, *shape), masked or not, in the order of the image."""
+        """Return an array (*shape,) or (n_times, *shape), masked or not, transposed and flipped as the image."""
         array = np.asanyarray(values)
         before = array.ndim - len(self.axes)
         array = array.transpose(*range(before), *(before + a for a in self.axes))
         return np.flip(array, tuple(before + a for a, turn in enumerate(self.turned) if turn))
 
     def tensors(self, values: Real[ArrayLike, "*shape d d"]) -> Real[np.ndarray, "*turned d d"]:
-        """Return tensors (*shape, d, d) in the order of the image, with components along its axes."""
+        """Return tensors (*shape, d, d) with nodes and components along the axes of the image."""
         signs = np.where(self.turned, -1, 1)
         components = np.moveaxis(np.asarray(values), (-2, -1), (0, 1))[np.ix_(self.axes, self.axes)]
         return np.moveaxis(self.array(components), (0, 1), (-2, -1)) * np.outer(signs, signs)
 
     def node(self, node: Sequence[int], shape: Sequence[int]) -> tuple[int, ...]:
-        """Return the image indices of a node of an array with the given shape."""
+        """Return a node's indices in the image from its indices in an array of the given shape."""
         turned = zip(self.axes, self.turned, strict=True)
         return tuple(shape[a] - 1 - node[a] if turn else node[a] for a, turn in turned)
 
     def letter(self, ax: Axes, plane: tuple[int, int] = (0, 1)) -> None:
-        """Write letters at the edges of an image that two axes span; mirror the image for the radiological view."""
+        """Write the anatomical letters (L, R, …) at an image's edges; mirror the image for the radiological view."""
         horizontal, vertical = (self.ends[a] for a in plane)
         left, right, bottom, top = *horizontal, *vertical
         if self.view == "radiological" and horizontal == LETTERS[0]:

@@ -141,7 +141,7 @@ def checked_times(times: Any, shape: tuple[int, ...], **arrays: Any) -> Float[np
 
 
 def panel_titles(t: Float[np.ndarray, " n_times"], titles: Sequence[str] | None, unit: str) -> Sequence[str]:
-    """Return a title for each time; raise ValueError if the number of titles differs."""
+    """Return a title for each time; raise ValueError if the number of titles differs from the number of times."""
     if titles is None:
         return [f"$t$ = {number_text(s)} {unit}".rstrip() for s in t]
     if len(titles) != t.size:

@@ -24,9 +24,9 @@ POWERS = {2: (r"4\pi t", "t^{-1}"), 3: (r"(4\pi t)^{3/2}", "t^{-3/2}")}
 """The factor of the normalisation "flat" and the unit of the signature, by dimension; t is a squared length."""
 METRICS = {"tensor": "D", "inverse": "D⁻¹", "adjugate": "|D|D⁻¹"}
 LEAST_RANGE = 0.01
-"""The least range of the colours relative to the values, below which contrast is not enhanced."""
+"""The colour range is at least 1 % of the values, so that the contrast of nearly constant values is low."""
 RIM = 5
-"""The distance from the boundary, in nodes, below which values do not set the colours; the HKS is higher there."""
+"""Values within 5 nodes of the boundary do not affect the colour range, because the boundary raises the HKS."""
 
 
 def signature_panels(
@@ -39,16 +39,16 @@ def signature_panels(
 ) -> Figure:
     """Return a figure of a signature on a slice, or on three slices of a volume, with separate colours for each time.
 
-    The colours span the values away from the boundary, and a colour bar has arrows if other values lie beyond. With
-    "flat" normalisation the colours diverge from 1, the value for a flat metric, unless most values are far above 1.
-    With error bars, values that noise explains fade. Titles contain √(Dt), the distance of diffusion, if it is known.
+    The colour range contains nearly all values away from the boundary, and colour bars have arrows if other values
+    exceed the range. With "flat" normalisation the colours diverge from 1, the value for a flat metric, unless most
+    values are far above 1. Values that noise explains fade to grey. Titles contain diffusion lengths √(Dt), if known.
 
     Args:
         result: the signature to draw.
         path: the file in which to save the figure, if given.
         title: the title, by default the normalisation and the metric.
         view: ``"neurological"`` (left is on the left) or ``"radiological"`` (left is on the right), for data in space.
-        through: the voxel through which slices run (or else the nearest in the domain); by default a central voxel.
+        through: the voxel through which slices run, or the nearest voxel in the domain; by default a central voxel.
 
     Raises:
         ValueError: if the result is on a mesh.
@@ -92,8 +92,9 @@ def caption(result: Result) -> str:
 
 
 def titles_of(result: Result) -> Sequence[str]:
-    """Return a title for each time of a signature."""
-    titles = panel_titles(result.times, None, result.unit)
+    """Return a title for each time of a signature, with the length √(Dt) if it is known."""
+    early = [" (too few eigenpairs)" * bool(t < result.smallest_time) for t in result.times]
+    titles = [title + why for title, why in zip(panel_titles(result.times, None, result.unit), early, strict=True)]
     if result.lengths is None:
         return titles
     lengths = (f"{length:.3g} {result.length_unit}".rstrip() for length in result.lengths)
@@ -103,7 +104,7 @@ def titles_of(result: Result) -> Sequence[str]:
 def _colours(result: Result, inside: Bool[np.ndarray, "*shape"]) -> list[Colours]:
     """Return the colours for each time, which span nearly all values away from the boundary."""
     rim = normalise_boundary(result.settings.get("boundary", "neumann"), inside.ndim)[-1]
-    # With "mean" the boundary has no effect, except at corners and, in a volume, in thin parts of the mask.
+    # The boundary condition "mean" removes the boundary's effect, except at corners and in thin parts of 3D masks.
     deep = inside if "mean" in rim and inside.ndim == 2 else away_from_rim(inside)
     span = (0.01, 0.99) if "mean" in rim else SPAN
     centre = 1.0 if result.normalisation == "flat" else None
@@ -137,7 +138,7 @@ def bounding_box(inside: Bool[np.ndarray, "*shape"], margin: int = 2) -> tuple[s
 
 
 def away_from_rim(inside: Bool[np.ndarray, "*shape"]) -> Bool[np.ndarray, "*shape"]:
-    """Mark nodes at least `RIM` nodes from the boundary, or closer nodes too if less than a third would remain."""
+    """Mark nodes at least `RIM` nodes from the boundary, or at a smaller distance if less than a third were marked."""
     deep = inside
     for _ in range(RIM):
         smaller = ndimage.binary_erosion(deep)

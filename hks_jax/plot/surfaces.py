@@ -73,7 +73,7 @@ def surface(
     corners = vertices[mesh.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    # The absolute value |n·l| makes the orientation of triangles irrelevant.
+    # The absolute value of the cosine between the normal and the light makes the orientation of triangles irrelevant.
     brightness = 1 - relief * (1 - np.abs(normals @ LIGHT) / np.linalg.norm(LIGHT))
 
     mappable = ScalarMappable(Normalize(vmin, vmax), colormaps[cmap])
@@ -86,7 +86,7 @@ def surface(
         Poly3DCollection(corners, facecolors=colours, edgecolors=colours, **{"linewidths": 0.2, **kwargs})
     )
     low, high = vertices.min(axis=0), vertices.max(axis=0)
-    thin = np.maximum(1e-3 * (high - low).max() - (high - low), 0) / 2  # a flat surface also needs a box
+    thin = np.maximum(1e-3 * (high - low).max() - (high - low), 0) / 2  # gives a flat surface a thin bounding box
     low, high = low - thin, high + thin
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     ax.set_box_aspect(tuple(high - low), zoom=0.8 * zoom if thin.any() else zoom)  # shows a flat surface's corners
@@ -112,7 +112,7 @@ def isosurfaces(
 ) -> ScalarMappable:
     """Render isosurfaces in parallel projection on axes, and return the mappable for a colour bar.
 
-    The result is an image with the present size of the axes. Rendering needs PyVista (``pip install
+    The isosurfaces are drawn as an image with the current size of the axes. Rendering needs PyVista (``pip install
     "hks-jax[pyvista]"``) and, without a display, EGL or OSMesa.
 
     Args:
@@ -186,7 +186,6 @@ def isosurfaces(
 
 
 def _rim(pyvista: ModuleType, domain: Any) -> Any:
-    """Return the surface of the domain."""
     from vtkmodules.vtkFiltersGeometry import vtkGeometryFilter
 
     surface = vtkGeometryFilter()

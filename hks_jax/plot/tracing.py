@@ -1,6 +1,6 @@
 """Integral lines of the eigenvector fields of a 2D tensor field.
 
-An eigenvector has no sign, but the tensor is unambiguous. So the tensors at the nodes are interpolated bilinearly. The
+Eigenvectors have no sign, so tensors instead of eigenvectors are interpolated bilinearly between the nodes. The
 direction at a point follows from the interpolated tensor in closed form, and its sign from the previous direction.
 """
 
@@ -36,7 +36,7 @@ class DirectionField:
         grid = field.grid
         tensors = np.asarray(field.domain_tensors, dtype=np.float64)
         self.which = which
-        # The components are (λ₁ − λ₂) cos 2θ, (λ₁ − λ₂) sin 2θ and λ₁ + λ₂, where θ is the major direction's angle.
+        # For eigenvalues λ₁ ≥ λ₂ and the major angle θ, components are (λ₁ − λ₂) cos 2θ, (λ₁ − λ₂) sin 2θ and λ₁ + λ₂.
         difference = tensors[..., 0, 0] - tensors[..., 1, 1]
         components = np.stack([difference, 2 * tensors[..., 0, 1], np.trace(tensors, axis1=-2, axis2=-1)], -1)
         components[~grid.inside] = np.nan
@@ -101,7 +101,7 @@ def evenly_spaced_lines(
 ) -> list[Float[np.ndarray, "m 2"]]:
     """Return integral lines that fill the domain at distances of about `separation`, in coordinate units.
 
-    The method is due to Jobard and Lefer, “Creating evenly-spaced streamlines of arbitrary density” (1997). The next
+    The method is due to Jobard and Lefer, “Creating evenly-spaced streamlines of arbitrary density” (1997). Each new
     line starts as close as allowed to the existing lines. A line ends where it is closer than half the separation to
     another line or to itself. Circles are closed.
 
@@ -125,7 +125,7 @@ def evenly_spaced_lines(
     lines: list[np.ndarray] = []
     tree: cKDTree | None = None
     centre = np.array([0.5 * (a[0] + a[-1]) for a in field.grid.axes])
-    # The distance from each candidate to the existing lines or, for the first line, to a point near the middle.
+    # The distance from each possible seed to the existing lines or, for the first line, to a point near the middle.
     distance = separation + np.linalg.norm(seeds - centre - 0.3 * separation, axis=1)
     free = np.array([len(f) > 0 for f in forward])
     while True:
@@ -145,7 +145,7 @@ def evenly_spaced_lines(
 
 
 def _grow(forward: np.ndarray, backward: np.ndarray, others: cKDTree | None, gap: float, step: float) -> np.ndarray:
-    """Cut a line where it is closer than `gap` to the others or to itself; join its ends if they meet."""
+    """Cut a line where it is closer than `gap` to other lines or to itself; close the line if its ends meet."""
     if others is not None:
         forward, backward = (half[: _first(others.query(half)[0] < gap)] for half in (forward, backward))
     # Points that are fewer than `lag` steps apart may be close only because they are neighbours on the line.
@@ -213,7 +213,6 @@ def _lengths(field: TensorField, step: float | None, max_length: float | None) -
 
 
 def _candidates(field: TensorField, spacing: float) -> np.ndarray:
-    """Return points on a slightly jittered grid of about the given spacing."""
     axes = field.grid.axes
     counts = [max(2, int(np.ceil((a[-1] - a[0]) / spacing))) for a in axes]
     widths = [(a[-1] - a[0]) / n for a, n in zip(axes, counts, strict=True)]

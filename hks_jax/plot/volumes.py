@@ -23,6 +23,8 @@ PLANES = ((0, 1), (0, 2), (1, 2))
 """The horizontal and vertical axes of the three slices."""
 _COLUMN, _COLUMNS = 2.3, 6
 """The width of a column of slices in inches, and the maximum number of columns."""
+_LEAST_HEIGHT = 0.8
+"""The least height of a slice in inches, which leaves room for the labels of its vertical axis."""
 
 
 def middle_node(inside: Bool[np.ndarray, "*shape"]) -> tuple[int, ...]:
@@ -57,13 +59,13 @@ def orthogonal_slices(
     """Draw the slices xy, xz and yz of a volume through a node in the same colours, and return the last image.
 
     Args:
-        axes: three axes, for the planes xy, xz and yz in this order.
+        axes: three Matplotlib axes for the planes xy, xz and yz, in this order.
         values: (*shape,), with NaN at nodes without a value.
-        grid: the 3D grid of the values, whose spacing determines the aspect.
-        node: the indices (i, j, k) of the node. If this node has no value, the nearest node with a value is used. The
-            default is `middle_node` of the nodes with a value.
+        grid: the 3D grid of the values, whose spacing determines the aspect ratio of the slices.
+        node: the indices (i, j, k) of the node. If the given node has no value, the nearest node with a value is used.
+            The default node is the middle of all nodes with a value (`middle_node`).
         cross: whether thin lines show the positions of the other two slices.
-        orientation: the orientation of the grid in space, which turns slices and adds coordinates and letters.
+        orientation: the grid's orientation in space, by which slices are turned and their sides are labelled (L, R, …).
         z: (*shape,); values within the noise fade as in `scalar_image`.
         **kwargs: arguments of `scalar_image` for the whole volume, such as cmap, vmin, vmax, centre, quantiles.
 
@@ -153,7 +155,7 @@ def volume_panels(
     rows = math.ceil(t.size / _COLUMNS)
     columns = math.ceil(t.size / rows)
     sizes = np.multiply(shown.shape, shown.spacing)
-    heights = [float(np.clip(_COLUMN * sizes[up] / max(sizes[:2]), 0.25, 3 * _COLUMN)) for _, up in PLANES]
+    heights = [float(np.clip(_COLUMN * sizes[up] / max(sizes[:2]), _LEAST_HEIGHT, 3 * _COLUMN)) for _, up in PLANES]
     coordinates = [f"{name} ({length_unit})" if length_unit else name for name in AXES]
     fig = new_figure(
         columns * (_COLUMN + 0.2) + 0.6, rows * (sum(heights) + 1.35 + 0.15 * bool(label)) + 0.3 * bool(suptitle)
@@ -189,12 +191,12 @@ def require_volume(grid: Grid) -> None:
 def _turned(
     array: np.ma.MaskedArray, grid: Grid, node: Sequence[int] | None, orientation: Orientation | None
 ) -> tuple[np.ma.MaskedArray, Grid, tuple[int, ...]]:
-    """Return values, grid and the nearest node with a value in the order of the image."""
+    """Return the values, the grid and the nearest node with a value along the axes of the image."""
     if node is not None:
         nodes = np.argwhere(~np.ma.getmaskarray(array))
         node = nodes[np.argmin(np.sum((nodes - np.asarray(node)) ** 2, axis=1))].tolist()
     if orientation is not None:
         node = None if node is None else orientation.node(node, grid.shape)
         array, grid = orientation.array(array), orientation.grid(grid)
-    # The middle node is determined along the axes of the picture, so that ties do not depend on the storage order.
+    # The array is turned before the middle node is chosen, so that the choice does not depend on the storage order.
     return array, grid, middle_node(~np.ma.getmaskarray(array)) if node is None else tuple(node)

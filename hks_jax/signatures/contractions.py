@@ -19,21 +19,21 @@ from hks_jax.signatures.filters import Filter, mixing
 
 _matmul = partial(jnp.matmul, precision="highest")
 _ON_HOST = 1 << 22
-"""NumPy computes derivatives if the eigenvectors, and all filters' matrices, have at most this number of entries."""
+"""NumPy computes derivatives if neither the eigenvectors nor all filters' matrices have more entries than this."""
 
 
 class Contraction(eqx.Module):
-    """A function that is linear in the kernel Φ C Φᵀ of a matrix C (k, k), and linear in its own array leaves."""
+    """A linear function of the kernel Φ C Φᵀ of a matrix C (k, k), which is also linear in its own array attributes."""
 
     @abstractmethod
     def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m *s n"]:
-        """Return the values for each diagonal matrix C = diag(weights)."""
+        """Return the contraction of the kernel of each diagonal matrix C = diag(weights)."""
 
     @abstractmethod
     def mixed(
         self, matrices: Float[Array, "m k k"], vectors: Float[Array, "k n"], matters: Bool[Array, "m k"]
     ) -> Float[Array, "m *s n"]:
-        """Return the values for each symmetric C. Cᵢⱼ is negligible where ``matters`` is false for i and for j."""
+        """Return the contraction for each symmetric C. Cᵢⱼ is negligible unless ``matters`` marks pair i or pair j."""
 
 
 class Diagonal(Contraction):
@@ -51,7 +51,7 @@ class Diagonal(Contraction):
 
 
 class _Bilinear(Contraction):
-    """Sums Σᵢⱼ Cᵢⱼ aᵢ φⱼ(x), whose coefficients a (s, k) are linear in the eigenfunctions."""
+    """The sums Σᵢⱼ Cᵢⱼ aᵢ φⱼ(x) for each of s vectors a of coefficients, which are linear in the eigenfunctions."""
 
     @abstractmethod
     def coefficients(self, vectors: Float[Array, "k n"]) -> Float[Array, "s k"]:
@@ -69,7 +69,7 @@ class _Bilinear(Contraction):
 
 
 class Applied(_Bilinear):
-    """The products Φ C Φᵀ w of the kernel with functionals w."""
+    """The products Φ C Φᵀ w of the kernel matrix with each of s vectors w."""
 
     functionals: Float[Array, "s n"]
 
@@ -95,7 +95,7 @@ class Columns(_FromSources, _Bilinear):
 class SquaredDistances(_FromSources):
     """The squared distances (φ(x) − φ(x_s))ᵀ C (φ(x) − φ(x_s)) between source nodes x_s and all nodes x.
 
-    The differences are formed before they are squared, because the expanded terms would cancel at large times.
+    The differences are formed before they are squared: the terms of the expanded square would cancel at large times.
     """
 
     def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m s nodes"]:
@@ -125,7 +125,7 @@ def shapes(contraction: Contraction, filters: Filter, pairs: tuple[Array, Array,
 
 
 def by_numpy(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
-    """Compute the derivative of a diagonal, or its cotangents, with NumPy; return None if JAX should compute them."""
+    """Compute the derivative of a kernel's diagonal, or its transpose, with NumPy; return None if JAX should."""
     contraction, filters, pairs, _, selection, fixed, copies, space, _, reader = known
     values, vectors, kept = map(np.asarray, pairs)
     k = len(values) if selection is None else len(selection[0])
@@ -141,7 +141,8 @@ def by_numpy(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
         np.asarray, mixing(filters, jax.device_put(values), jax.device_put(kept), fixed)
     )
     change = x[8]
-    # Only the first n pairs matter, so the symmetric sum over i and j needs only i < n. Terms with j ≥ n count twice.
+    # For each filter, the matrix entry (i, j) is negligible unless i < n or j < n. The matrices are symmetric, so a sum
+    # over i < n and all j is enough, if its terms with j ≥ n count twice.
     last = [int(np.max(np.flatnonzero(one), initial=-1)) + 1 for one in matters]
     times = [np.where(np.arange(k) < n, 1, 2) for n in last]
 
@@ -158,7 +159,7 @@ def by_numpy(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
             matrix = (of_f[one] * stiffness - of_lambda_f[one] * mass)[:n] * count
             result[one] += np.sum(vectors[:n] * (matrix @ vectors), axis=0)
         return result
-    # The transpose of the steps above follows.
+    # From the cotangent of the diagonal, the transposed derivative computes the cotangents of its arguments.
     stiffness, mass = np.zeros((k, k), vectors.dtype), np.zeros((k, k), vectors.dtype)
     for one, (n, count) in enumerate(zip(last, times, strict=True)):
         outer = (vectors[:n] * y[0][one]) @ vectors.T * count

@@ -110,7 +110,7 @@ def global_point_signature(pairs: Eigenpairs) -> Float[Array, "m *shape"]:
 
 
 MARGIN = 10.0
-"""The least accepted ratio of a kernel to its truncation error; there, the kernel's logarithm has an error of 0.1."""
+"""The least accepted ratio of a kernel to its truncation error, at which the kernel's logarithm has an error of 0.1."""
 GRID_LIMIT = 0.1
 """The largest accepted relative error of a squared distance due to the grid spacing."""
 
@@ -121,9 +121,9 @@ def varadhan_distance(
     """Estimate the geodesic distance by Varadhan's formula: d(x_s, x)² is the limit of −4t log k_t(x_s, x) as t → 0.
 
     See Varadhan 1967 and Zobel, Reininghaus and Hotz, section 2. At a time t > 0 the kernel in n dimensions is
-    (4πt)^(−n/2) exp(−d²/4t) (u₀ + O(t)). Normalisation by the diagonal, k_t(x_s, x)/√(k_t(x_s, x_s) k_t(x, x)), removes
-    the power of t. The error of d² is then −4t log u₀ + O(t²), which vanishes on a flat domain away from its boundary.
-    Without normalisation the error has the further term 2nt log 4πt.
+    (4πt)^(−n/2) exp(−d²/4t) (u₀ + O(t)), where the function u₀ is 1 on a flat domain away from its boundary. Division
+    by the diagonal, k_t(x_s, x)/√(k_t(x_s, x_s) k_t(x, x)), removes the power of t. The normalised kernel estimates d²
+    with the error −4t log u₀ + O(t²). The kernel without normalisation adds 2nt log 4πt to the error of d².
 
     Small times need fine grids and many pairs: with linear elements of node spacing h, d² has the relative error
     h²d²/48t², and exp(−d²/4t) must exceed the truncation and rounding errors. The result is NaN where the estimated
@@ -132,11 +132,12 @@ def varadhan_distance(
 
     Args:
         pairs: the result of `eigenpairs`; more pairs resolve larger distances. Geodesics stay in the domain: they go
-            around holes and across periodic sides. Under ``"mirror"`` and ``"mean"`` geodesics ignore straight sides.
-        times: (n_times,) positive, in (metric length)²; a time of about d·h suits the distance d.
+            around holes and across periodic sides. Under ``"mirror"`` and ``"mean"`` straight sides have no effect if
+            the metric is flat.
+        times: (n_times,) positive, in (metric length)²; a time near d·h suits distances d on a grid of node spacing h.
         sources: node indices (n_sources, d), or (d,) for one source; vertex numbers (n_sources,) on a mesh.
-        normalised: whether to divide by the diagonal. Otherwise the result depends on the unit of length, and is NaN
-            where k_t > 1.
+        normalised: whether to divide by the diagonal. The unnormalised result depends on the unit of length, and is NaN
+            where the kernel exceeds 1.
 
     Raises:
         ValueError: if times are invalid or if a source is out of range, outside the mask or at a Dirichlet node.
@@ -165,7 +166,7 @@ def varadhan_distance(
     _warn_of_distance(pairs, times, relative, by_pairs, by_grid)
     defined = relative > jnp.maximum(by_pairs, by_grid)
     if normalised:
-        # At distance zero the root has no derivative and the kernel may differ from 1 by rounding, so 0 is inserted.
+        # At distance zero, rounding may change the kernel, and √ has no derivative, so the distance is set to zero.
         numbers = np.arange(space.domain.size).reshape(1, *space.node_shape)
         zero = (relative >= 1) | (numbers == _broadcast(nodes, space))[None]
     else:
@@ -181,27 +182,27 @@ def _broadcast(values: Any, space: FunctionSpace) -> Any:
     return values.reshape(*values.shape, *[1] * len(space.node_shape))
 
 
-# By the Cauchy–Schwarz inequality the errors of the normalised kernel are about as large as the errors of its diagonal.
-# The errors of the diagonal are the truncated share of the trace, and the residuals weighted by the terms of the trace.
+# By the Cauchy–Schwarz inequality the error of the normalised kernel is about as large as the relative error of the
+# kernel's diagonal, which is about the truncated share of the heat trace plus the mean residual with weights exp(−λᵢt).
 #
-# Linear elements have the eigenvalue λ = ξ² (1 + ξ²h²/12) and the mass m = 1 − ξ²h²/6 at the frequency ξ along an axis.
-# In the kernel ∫ exp(iξd − tλ)/m dξ the means of powers of ξ are ⟨ξ²⟩ = (2t − d²)/4t² and ⟨ξ⁴⟩ = (d⁴ − 12td² +
-# 12t²)/16t⁴. To first order in h² the error of the squared distance is d²h² (d² − 4t)/48t², or −d²h² (d² − 12t)/48t²
-# with a lumped mass. Where this error matters, d² is several times t. The relative error of d² is then d²h²/48t², which
-# is h²/12t · log 1/k with d² = 4t log 1/k.
+# On an axis with the node spacing h, linear elements give a wave of frequency ξ the eigenvalue λ = ξ² (1 + ξ²h²/12) and
+# the mass m = 1 − ξ²h²/6. In the kernel ∫ exp(iξd − tλ)/m dξ at the distance d, the means of powers of ξ are ⟨ξ²⟩ = (2t
+# − d²)/4t² and ⟨ξ⁴⟩ = (d⁴ − 12td² + 12t²)/16t⁴. To first order in h² the estimate of d² has the error d²h² (d² −
+# 4t)/48t², or −d²h² (d² − 12t)/48t² with a lumped mass. Where d² is several times t, and the error matters, the
+# relative error is about d²h²/48t², or (h²/12t) log(1/k) if d² is 4t log(1/k) with the normalised kernel k.
 def _least_kernels(
     pairs: Eigenpairs, times: Float[Array, " m"], nodes: Int[np.ndarray, " s"]
 ) -> tuple[Float[Array, "m 1 *ones"], Float[Array, "m s *shape"]]:
-    """Return the least normalised kernels that the pairs resolve, and the least ones that the grid resolves."""
+    """Return the least values of the normalised kernel that the eigenpairs resolve, and that the grid resolves."""
     pairs, times = jax.lax.stop_gradient((pairs, times))
     space, resolution = pairs.space, pairs.pencil.resolution
     if resolution is None:
-        raise ValueError("pairs: got eigenpairs without the needed node spacing; expected a grid or linear elements")
+        raise ValueError("pairs: got eigenpairs of unknown node spacing; expected a grid or linear elements")
     weights = jnp.where(pairs.kept[None], jnp.exp(-times[:, None] * pairs.eigenvalues[None]), 0)
     residuals = jnp.sum(weights * jnp.where(pairs.kept, pairs.residuals, 0)[None], axis=1) / jnp.sum(weights, axis=1)
     error = MARGIN * truncation(pairs, times).tail + residuals + 100 * jnp.finfo(times.dtype).eps
     at_nodes = jnp.where(space.free, jnp.square(resolution.mesh_width), 0)
-    # The spacing along the geodesic is not known. The larger of the mean spacing and the spacing at its ends is used.
+    # The spacing along a geodesic is replaced by the larger of the mean spacing and the spacing at the geodesic's ends.
     along = jnp.maximum(
         jnp.maximum(at_nodes[None], _broadcast(at_nodes.ravel()[nodes], space)), jnp.sum(at_nodes) / space.n_dof
     )
@@ -212,7 +213,6 @@ def _least_kernels(
 def _warn_of_distance(
     pairs: Eigenpairs, times: Float[Array, " m"], relative: Array, by_pairs: Array, by_grid: Array
 ) -> None:
-    """Issue an AccuracyWarning if nodes are too far from a source and values are concrete."""
     relative, by_pairs, by_grid = jax.lax.stop_gradient((relative, by_pairs, by_grid))
     if is_traced((relative, by_pairs, by_grid)):
         return
@@ -223,7 +223,7 @@ def _warn_of_distance(
         worst = int(np.argmax(far.mean(axis=(1, 2))))
         remedy = "more eigenpairs (in float64)" if 2 * too_small.sum() >= far.sum() else "a finer grid"
         warn_of_accuracy(
-            f"times: {far.mean():.1%} of the distances are NaN, {far[worst].mean():.1%} at t = "
-            f"{float(times[worst]):.4g}, because the heat kernel is not resolved at such distances. Use larger "
-            f"times or {remedy}"
+            f"times: {far.mean():.1%} of the distances are NaN ({far[worst].mean():.1%} at t = "
+            f"{float(times[worst]):.4g}), because the heat kernel is not resolved between nodes so far apart. Use "
+            f"larger times or {remedy}"
         )

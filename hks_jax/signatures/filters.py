@@ -1,4 +1,4 @@
-"""Filters, which are functions f(λ) of the eigenvalue, and the divided differences by which they mix eigenvectors."""
+"""Filters, which are functions f(λ) of the eigenvalue, and their divided differences, which derivatives need."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -30,7 +30,7 @@ class Filter(eqx.Module):
 
 @jax.custom_jvp
 def _mean_decay(y: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Return the mean of exp(−sy) over s from 0 to 1, where y ≥ 0."""
+    """Return (1 − e^(−y))/y, the mean of exp(−sy) over s from 0 to 1, for y ≥ 0."""
     return jnp.where(y > 0, -jnp.expm1(-y) / jnp.where(y > 0, y, 1), 1)
 
 
@@ -39,7 +39,7 @@ def _mean_decay_jvp(
     primals: tuple[Float[Array, "*n"]], tangents: tuple[Float[Array, "*n"]]
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
     def free_of_cancellation(y: Array) -> Array:
-        """Return the mean of exp(−sy) over s from 0 to 1; where y is small, the mean is computed by quadrature."""
+        """Return (1 − e^(−y))/y; where y is small, by quadrature of the mean of exp(−sy)."""
         small = y < 1
         nodes, weights = gauss(8)
         near = sum(w * jnp.exp(-s * jnp.where(small, y, 0)) for s, w in zip(nodes, weights, strict=True))
@@ -60,7 +60,7 @@ class Heat(Filter):
         return jnp.exp(-self.time * x)
 
     def divided_difference(self, low: Float[Array, "*n"], high: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return −t exp(−t·low) (1 − e^(−y))/y, where y = t (high − low)."""
+        """Return (f(high) − f(low))/(high − low) as −t exp(−t·low) (1 − e^(−y))/y, where y is t (high − low)."""
         return -self.time * jnp.exp(-self.time * low) * _mean_decay(self.time * (high - low))
 
 
@@ -73,7 +73,7 @@ class Wave(Filter):
 
     @jax.jit
     def __call__(self, x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return the Gaussian function of log x."""
+        """Return f(x), a Gaussian function of log x with the mean ``energy`` and the standard deviation ``sigma``."""
         positive = x > 0
         logarithm = jnp.log(jnp.where(positive, x, 1))
         bell = jnp.exp(-jnp.square((self.energy - logarithm) / self.sigma) / 2 - self.offset)
@@ -91,7 +91,7 @@ class Power(Filter):
 
 
 class Custom(Filter):
-    """Any function f(parameters, λ) that JAX differentiates twice, elementwise in λ."""
+    """A user's function f(parameters, λ), which acts elementwise on λ and which JAX can differentiate twice."""
 
     function: Callable[[Any, Array], Array] = eqx.field(static=True)
     parameters: Any
@@ -112,14 +112,14 @@ class Derivative(Filter):
         return jax.jvp(lambda f: f(x), (self.filter,), (self.direction,))[1]
 
     def divided_difference(self, low: Float[Array, "*n"], high: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return the directional derivative of the divided difference."""
+        """Return the directional derivative of the divided difference of the filter f."""
         if type(self.filter).divided_difference is Filter.divided_difference:
             return super().divided_difference(low, high)
         return jax.jvp(lambda f: f.divided_difference(low, high), (self.filter,), (self.direction,))[1]
 
 
 def weights_of(one: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"]) -> Float[Array, " k"]:
-    """Return f(λᵢ), or zero if the pair is not kept."""
+    """Return f(λᵢ), or zero for eigenpairs i that ``kept`` excludes."""
     return jnp.where(kept, one(values), 0)
 
 
@@ -127,9 +127,9 @@ def weights_of(one: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"])
 def mixing(
     filters: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"], fixed: bool
 ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"], Float[Array, "m k k"], Bool[Array, "m k"]]:
-    """Return f(λᵢ), the divided differences of f and λf, and whether f or λf' matters at λᵢ, for each filter f.
+    """Return f(λᵢ), the divided differences of f and λf, and marks of pairs that matter, for each filter f.
 
-    A value does not matter if it is negligible relative to the largest value at positive eigenvalues.
+    Pair i does not matter if f(λᵢ) and λᵢ f'(λᵢ) are negligible relative to the largest such value at λ > 0.
     """
     rows, columns = values[:, None], values[None]
     low, high, gap = jnp.minimum(rows, columns), jnp.maximum(rows, columns), rows - columns
@@ -138,13 +138,13 @@ def mixing(
         f = weights_of(one, values, kept)
         quotient = (f[:, None] - f[None]) / jnp.where(gap == 0, 1, gap)
         of_f = jnp.where(kept[:, None] & kept[None], one.divided_difference(low, high), quotient)
-        # If all perturbations annihilate the null vectors, ``of_f`` has no effect between them, and f' may not exist.
+        # Between null vectors ``of_f`` has no effect if no perturbation acts on them, and f' may not exist at zero.
         of_f = jnp.where((high == 0) & (fixed | ~jnp.isfinite(of_f)), 0, of_f)
-        # Using f at the larger eigenvalue, where f is small, avoids cancellation.
+        # The sum f(low) + high · ``of_f`` has the same value, but its terms cancel, because f usually decreases.
         of_lambda_f = jnp.where(gap >= 0, f[:, None], f[None]) + low * of_f
         size = jnp.maximum(jnp.abs(f), jnp.abs(values * jnp.diagonal(of_f)))
-        # Between two negligible pairs, the divided difference is at most f' at one of the pairs or, if f is not
-        # monotone, ε over the relative gap. NaN counts as not negligible.
+        # For two negligible pairs i and j, the divided difference is at most f' at one of them if f is monotone, and at
+        # most ε divided by the relative gap of λᵢ and λⱼ if f is not. NaN counts as not negligible.
         negligible = size <= jnp.finfo(f.dtype).eps * jnp.max(jnp.where(values > 0, size, 0))
         return f, of_f, of_lambda_f, ~negligible
 

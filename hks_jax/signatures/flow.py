@@ -28,7 +28,7 @@ def heat_flow(pairs: Eigenpairs, times: Any, functions: Any) -> Float[Array, "n_
 
     Args:
         pairs: the result of `eigenpairs`. The boundary conditions of the pairs also hold for u. Values at Dirichlet
-            nodes are not used. ``"mirror"`` and ``"mean"`` extend u evenly, which gives the same flow as ``"neumann"``.
+            nodes are not used. Under ``"mirror"`` and ``"mean"`` u is reflected, so the flow is as under ``"neumann"``.
         times: (n_times,) positive, in (metric length)².
         functions: (*shape), or (…, *shape) for several functions; values outside the mask are not used.
 
@@ -74,8 +74,8 @@ def _warn_if_truncated(pairs: Eigenpairs, times: Float[Array, " n_times"], rows:
     if left > TAIL_LIMIT:
         enough = np.log(share / TAIL_LIMIT) / rate
         warn_of_accuracy(
-            f"times: in the heat flow at t = {float(jnp.min(times)):.4g}, up to {left:.1%} of a function's norm "
-            f"belongs to eigenpairs that were not computed. Use times of at least {enough:.4g}, or more eigenpairs",
+            f"times: at t = {float(jnp.min(times)):.4g} up to {left:.1%} of a function's norm in the heat flow lies "
+            f"beyond the computed eigenpairs. Use times of at least {enough:.4g}, or more eigenpairs",
         )
 
 
@@ -115,7 +115,7 @@ def tensor_invariants(field: TensorField) -> dict[str, Float[np.ndarray, "*shape
 def gaussian_scale_space(
     field: TensorField, times: Any, functions: Any
 ) -> Float[np.ndarray, "n_times *functions_and_shape"]:
-    """Blur functions by an isotropic Gaussian, whose constant width is the mean width to which heat spreads.
+    """Blur functions by an isotropic Gaussian of constant width, the mean width to which heat spreads in each time.
 
     In coordinates the standard deviation is √(2t/s), where s is the mean of |T|^(1/d) over the domain. Division by the
     blurred mask and reflection at the grid's sides preserve constants. The result is NaN outside the mask.

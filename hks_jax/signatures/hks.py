@@ -29,24 +29,25 @@ from hks_jax.spectrum_free.plan import Unattainable, choose_method, least_work, 
 from hks_jax.traced import is_traced
 
 _DEARER = 10.0
-"""The largest work for which both methods are compared at one time, relative to the work at the spectrum-free times."""
+"""The largest work for comparing the two methods at one time, relative to the work of the spectrum-free method."""
 
 Normalisation = Literal["raw", "heat-trace", "volume", "flat"]
 HKSMethod = Literal["spectral", "spectrum-free", "auto"]
 
 
 class AutomaticHKS(eqx.Module):
-    """A signature that is computed by two methods, each at some of the times, and the agreement of the methods.
+    """A heat kernel signature that comes from eigenpairs at some times, and from a spectrum-free method at the others.
 
     Attributes:
-        values: (n_times, *shape).
+        values: (n_times, *shape) the signature.
         times: (n_times,).
-        spectral: (n_times,) bool, true at times computed from eigenpairs, false at spectrum-free times.
-        tail: (n_times,) the estimated share of the signature beyond the eigenpairs, by which the method was chosen.
-        method: ``"colouring"`` or ``"selected-inversion"`` at spectrum-free times; ``"none"`` without such times.
-        overlap_time: the shortest time computed from eigenpairs, if the methods were compared there; otherwise NaN.
-        overlap_difference: the greatest difference at that time, relative to (4πt)^(−d/2); NaN if `overlap_time` is
-            NaN.
+        spectral: (n_times,) bool, whether the signature at a time was computed from eigenpairs.
+        tail: (n_times,) the estimated share of the signature that the eigenpairs lack, which decides the method.
+        method: the spectrum-free method, ``"colouring"`` or ``"selected-inversion"``; ``"none"`` if it was not used.
+        overlap_time: the shortest time from eigenpairs, at which both methods were compared; NaN if they were not.
+        overlap_difference: the greatest difference of the methods at `overlap_time`, relative to (4πt)^(−d/2), or NaN.
+        overlap_difference: the greatest difference between the two methods at `overlap_time`, relative to
+            (4πt)^(−d/2); NaN without comparison.
     """
 
     values: Float[Array, "n_times *shape"]
@@ -65,10 +66,11 @@ class AutomaticHKS(eqx.Module):
             some = [f"{t:.4g}" for t in times[which]]
             if some:
                 listed = ", ".join(some[:8]) + (" …" if len(some) > 8 else "")
-                lines.append(f"{len(some)} of {times.size} times by {name}: {listed}")
+                lines.append(f"{len(some)} of {times.size} times use {name}: {listed}")
         if math.isfinite(float(self.overlap_time)):
             lines.append(
-                f"at t = {float(self.overlap_time):.4g} the two methods differ by {float(self.overlap_difference):.1e}"
+                f"at t = {float(self.overlap_time):.4g} the signatures with and without eigenpairs differ by "
+                f"{float(self.overlap_difference):.1e} · (4πt)^(−d/2)"
             )
         return "\n".join(lines)
 
@@ -87,12 +89,13 @@ def hks(
 
     Args:
         times: (n_times,) positive, in (metric length)².
-        normalisation: ``"raw"``; ``"heat-trace"`` divides by Σᵢ exp(−λᵢt) (Sun et al.); ``"volume"`` multiplies by the
-            domain's area or volume (→ 1 for large t, except with a potential or a density); ``"flat"`` multiplies by
-            (4πt)^(d/2) (→ 1 for small t away from the boundary, or 1/ρ with a density ρ).
+        normalisation: ``"raw"`` is the signature itself. ``"heat-trace"`` divides it by the heat trace Σᵢ exp(−λᵢt)
+            (Sun et al.). ``"volume"`` multiplies it by the domain's area or volume, so that it tends to 1 for large t,
+            except with a potential or a density. ``"flat"`` multiplies it by (4πt)^(d/2), so that it tends to 1 for
+            small t away from the boundary, or to 1/ρ with a density ρ.
         method: ``"spectral"`` sums over the pairs. ``"spectrum-free"`` uses only the matrices of the pairs (see
-            `hks_spectrum_free`). ``"auto"`` uses the pairs at times that they resolve to the tolerance and the matrices
-            at the other times. `hks_auto` also reports the choice and the agreement of the methods.
+            `hks_spectrum_free`). ``"auto"`` sums over the pairs at times at which the sum is accurate to the tolerance,
+            and uses the matrices at the other times; `hks_auto` also reports its choice.
         tolerance: the allowed error of ``"spectrum-free"`` and ``"auto"``, relative to (4πt)^(−d/2).
 
     Raises:
@@ -128,9 +131,10 @@ def hks_auto(
 ) -> AutomaticHKS:
     """Compute the heat kernel signature with the suitable method at each time, and report the choice.
 
-    The signature is computed from the pairs at times at which the estimated share beyond the pairs is at most the
-    tolerance, and otherwise by `hks_spectrum_free`. If there are times of both kinds, both methods are compared at the
-    shortest time of the eigenpairs, provided that this takes at most ten times the work of the spectrum-free times.
+    The signature is computed from the pairs at times at which they lack at most the share `tolerance` of it (by the
+    estimate of `truncation`), and by `hks_spectrum_free` at the other times. If both methods are used, they are
+    compared at the shortest time computed from the pairs, unless the comparison takes more than ten times the work of
+    `hks_spectrum_free` at the other times.
 
     Args:
         times: (n_times,) positive; the normalisation is as in `hks`.
@@ -165,7 +169,7 @@ def hks_auto(
     settings = choose_method(pencil, times[small], "auto", tolerance)
     raw = hks_spectrum_free(pencil, times[small], method=settings or "selected-inversion", tolerance=tolerance)
     others = _scaled(pairs, times[small], normalisation, raw)
-    # The signature at spectrum-free times does not use the k pairs, so the warnings concern only the grid.
+    # `hks_spectrum_free` uses no eigenpairs, so at its times only the grid can cause a warning.
     some = jax.tree.map(lambda leaf: leaf[small] if leaf.ndim else leaf, estimate)
     for message in eqx.tree_at(lambda e: e.tail, some, jnp.zeros(small.size)).messages():
         warn_of_accuracy(message)
@@ -198,10 +202,7 @@ def _scaled(pairs: Eigenpairs, times: Float[Array, " m"], normalisation: str, va
 
 
 def _difference(pairs: Eigenpairs, times: Float[Array, " 1"], tolerance: float, most: float) -> Float[Array, ""]:
-    """Return the greatest difference of the two methods at one time, relative to (4πt)^(−d/2).
-
-    The result is NaN if the comparison exceeds the allowed work or if rounding exceeds the tolerance.
-    """
+    """Return the greatest difference of the signatures with and without pairs, relative to (4πt)^(−d/2), or NaN."""
     pencil = pairs.pencil
     try:
         settings = least_work(pencil, times, tolerance)
@@ -240,18 +241,18 @@ def boundary_influence(
     """Return the share of the heat kernel signature that is due to the boundary, (k_N − k_D)/(k_N + k_D).
 
     Here k_N ≥ k_D are the signatures with Neumann and with Dirichlet conditions on the whole boundary, including the
-    rim of a mask. At a distance d from a straight side of a flat domain the ratio is exp(−d²/t). The ratio is 1 on the
-    boundary, 0 where neither condition has an effect yet, and NaN outside the mask.
+    rim of a mask. The share is 1 on the boundary, 0 where the boundary has no effect yet at the time t, and NaN outside
+    the mask. At a distance d from a straight side of a flat domain the share is exp(−d²/t).
 
-    The result is differentiable with respect to the tensors. Eigenpairs of two problems are computed. Together the two
-    problems are the problem with the boundary ``"mean"``, whose signature is (k_N + k_D)/2.
+    The result is differentiable with respect to the tensors. The eigenpairs of a Neumann and of a Dirichlet problem are
+    computed, which together are the eigenpairs with the boundary ``"mean"`` and the signature (k_N + k_D)/2.
 
     Args:
-        domain: a metric in 2D or 3D, a mesh, or eigenpairs with the boundary ``"mean"``, which contain both problems.
+        domain: a metric in 2D or 3D, a mesh, or eigenpairs that were computed with the boundary ``"mean"``.
         times: (n_times,) positive, in (metric length)².
-        k: the number of eigenpairs of each problem; to be omitted if eigenpairs are given.
+        k: the number of eigenpairs of each of the two problems. Omit k if `domain` is given as eigenpairs.
         boundary: ``"neumann"`` or ``"mean"``, which are equivalent here. Grids also accept ``"periodic"``, as one value
-            for all axes or one per axis. To be omitted if eigenpairs are given.
+            for all axes or one per axis. Omit `boundary` if `domain` is given as eigenpairs.
         solver: the same as for `eigenpairs`.
 
     Raises:
@@ -278,7 +279,7 @@ def boundary_influence(
         pencil = assemble(domain, _glued(domain, boundary))
         pairs = (eigenpairs(part, k, solver=solver, multiplet="complete") for part in pencil.parts)
         free, zero = (hks(each, times) for each in pairs)
-    # Rounding (if both signatures are nearly equal) and truncation (if both are small) may give values outside [0, 1].
+    # Rounding of nearly equal signatures, or truncation of small signatures, may move the ratio out of [0, 1].
     return jnp.clip((free - zero) / (free + zero), 0, 1)
 
 

@@ -58,14 +58,16 @@ def scale_invariant_hks(
 ) -> Float[Array, "n_frequencies *shape"]:
     """Compute the scale-invariant HKS (Bronstein and Kokkinos 2010): |FFT(d/dτ log HKS(exp τ, x))| at low frequencies.
 
-    Scaling all lengths by β shifts τ by log β² and lowers log HKS by a constant. The derivative removes the constant,
-    and the modulus of the Fourier transform removes the shift. The default times scale with the spectrum, so invariance
-    is exact. The moduli are dimensionless, and NaN outside the mask and at Dirichlet nodes.
+    The variable τ is the logarithm of the time. Scaling all lengths by β shifts log HKS by log β² along τ, and
+    subtracts a constant, which the derivative d/dτ removes. The modulus of the Fourier transform does not depend on
+    shifts along τ. The default times scale with the spectrum, so invariance is exact. The moduli are dimensionless, and
+    NaN outside the mask and at Dirichlet nodes.
 
     Args:
         n_frequencies: the number of Fourier moduli, from frequency 0.
-        n_times: the number of samples of τ.
-        times: (n,) log-spaced times for comparison at absolute scales; by default from 4 ln10/λ_last to 4 ln10/λ₁.
+        n_times: the number of times, if `times` is not given.
+        times: (n,) log-spaced times; give all domains the same times to compare them at absolute scales. The default
+            runs from 4 ln10/λ_last to 4 ln10/λ₁.
 
     Examples:
         >>> nine = hj.eigenpairs(hj.TensorField(field.grid, 9 * field.tensors), k=12)
@@ -118,7 +120,7 @@ def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Arr
     if sigma.ndim != 0:
         raise ValueError(f"sigma: got shape {sigma.shape}; expected one positive width in log λ")
     require_number("sigma", sigma)
-    # The largest exponent is factored out of both sums to prevent underflow far outside the spectrum.
+    # Dividing the numerator and the denominator by the largest exponential prevents underflow far from all log λᵢ.
     offset = _largest_exponents(*jax.lax.stop_gradient((energies, sigma, pairs.eigenvalues, pairs.kept)))
     bells = Wave(energies, jnp.broadcast_to(sigma, energies.shape), offset)
     return spectral_diagonal(pairs, bells, 1 / spectral_trace(pairs, bells))

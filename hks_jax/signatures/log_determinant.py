@@ -18,13 +18,13 @@ from hks_jax.signatures.truncation import truncation
 from hks_jax.traced import is_traced
 
 _FIRST = 18.0
-"""The least product of the last eigenvalue and T, at which each further eigenvalue contributes less than 1e-9."""
+"""The least product of the last eigenvalue and the time T. Each further eigenvalue λ contributes E₁(λT) < 1e-9."""
 _TIMES, _PER_DOUBLING = 12, 2
-"""The number of times T that are tried, and the number of steps in which T doubles."""
+"""The number of times T that are tried, and the number of steps from a time T to the time 2T."""
 _DOUBTFUL = 0.01
 """The estimated error above which a warning is issued."""
 _SMALL, _TERMS, _NODES = 2.0, 20, 32
-"""The largest argument for the series of E₁, the number of terms, and the number of quadrature points beyond it."""
+"""The largest argument of E₁ for the series, its number of terms, and the number of quadrature points otherwise."""
 
 
 class LogDeterminant(NamedTuple):
@@ -33,8 +33,8 @@ class LogDeterminant(NamedTuple):
     Attributes:
         value: log det′ Δ.
         error: an estimate of the discretisation error and of omitted terms of the heat trace; constant in derivatives.
-        time: the time T; the heat trace comes from its coefficients before T, and from eigenvalues after T. T is
-            constant in derivatives.
+        time: the time T, up to which the heat trace is computed from its coefficients, and beyond which from
+            eigenvalues; constant in derivatives.
     """
 
     value: Float[Array, ""]
@@ -51,8 +51,8 @@ def heat_coefficients(
 ) -> Float[Array, " 3"]:
     """Return a₀, a₁, a₂ of the heat trace Σ exp(−λᵢt) ~ a₀/t + a₁/√t + a₂ of a surface (Kac 1966; McKean, Singer 1967).
 
-    With area V, boundary length L, Euler characteristic χ and corner angles θ, these are a₀ = V/4π, a₁ = ±L/8√π (+ for
-    Neumann conditions) and a₂ = χ/6 + Σ (π − θ)²/24πθ.
+    With area V, boundary length L, Euler characteristic χ and corner angles θ, the coefficients are a₀ = V/4π, a₁ =
+    ±L/8√π (+ for Neumann conditions) and a₂ = χ/6 + Σ (π − θ)²/24πθ.
 
     Args:
         pairs: the result of `eigenpairs` in 2D. Under "mirror" and "mean", V is the area of the doubled domain.
@@ -82,37 +82,36 @@ def heat_coefficients(
     return jnp.stack(known)
 
 
-# Let Z be the heat trace, n₀ the number of zero eigenvalues and T > 0. Then
+# Let Z(t) be the heat trace in d dimensions, n₀ the number of zero eigenvalues and T > 0. The zeta function satisfies
 #
 #     Γ(s) ζ(s) = ∫₀^∞ t^(s−1) (Z(t) − n₀) dt,    Z(t) ~ Σⱼ aⱼ t^pⱼ,    pⱼ = (j − d)/2.
 #
-# Up to T each term of the expansion of Z is integrated and continued analytically. Beyond T each exponential is
-# integrated. With 1/Γ(s) = s + γs² + … the derivative of ζ at zero is
+# From 0 to T each power of the expansion of Z is integrated and continued analytically; from T to ∞ each exponential
+# exp(−λᵢt) of Z is integrated. With 1/Γ(s) = s + γs² + … the derivative of ζ at zero is
 #
 #     −log det′ = ζ′(0) = (a_d − n₀) (log T + γ) + Σ_{j≠d} aⱼ T^pⱼ/pⱼ + Σ E₁(λᵢT).
 #
-# The error is ∫₀^T (Z − Σⱼ aⱼ t^pⱼ) dt/t, whose leading term is the first omitted power. Richardson extrapolation from
-# the values at T, 2T, 4T, … removes these powers.
+# The omitted terms of the expansion cause the error ∫₀^T (Z − Σⱼ aⱼ t^pⱼ) dt/t, a sum of powers of T. Richardson
+# extrapolation from the values at T, 2T, 4T, … removes the powers that `extrapolate` lists.
 def log_determinant(
     pairs: Eigenpairs, coefficients: Any, *, extrapolate: Sequence[float] = (), time: Any = None
 ) -> LogDeterminant:
     """Compute log det′ Δ = −ζ′(0), where ζ(s) = Σ λᵢ^(−s) is the sum over the positive eigenvalues.
 
-    The heat trace's expansion at small times accounts for the remaining eigenvalues. The result is differentiable with
-    respect to the eigenvalues and the coefficients. Errors of the eigenvalues limit the accuracy: if the expansion is
-    used up to the time T, linear elements with spacing h in 2D cause an error of about a₀h²/16T². So a small T requires
-    many pairs and a fine grid.
+    Up to a time T, the expansion of the heat trace at small times replaces the eigenvalues that are not computed. The
+    result is differentiable with respect to the eigenvalues and the coefficients. A small T requires many pairs, and a
+    fine grid: linear elements with spacing h in 2D cause an error of about a₀h²/16T².
 
     Args:
         pairs: the lowest eigenpairs, from `eigenpairs`.
-        coefficients: a₀ to at least a_d in Σ exp(−λᵢt) ~ Σⱼ aⱼ t^((j−d)/2), for example from `heat_coefficients`.
+        coefficients: at least a₀, …, a_d of the heat trace ~ Σⱼ aⱼ t^((j−d)/2), as from `heat_coefficients` for d = 2.
         extrapolate: the next powers of t in the expansion, with unknown coefficients: (1, 2) on a closed curved
             surface, (0.5, 1) with a curved boundary, none on flat tori and polygons.
         time: T, in (metric length)²; by default the time with the least estimated error.
 
     Raises:
-        ValueError: if there are fewer than d + 1 coefficients, if a power is not positive, if pairs are in an interval,
-            if an eigenvalue is negative or none is positive, or if the dimension is not known.
+        ValueError: if there are fewer than d + 1 coefficients, if a power is not positive, if the pairs are not the
+            lowest, if an eigenvalue is negative or none is positive, or if the dimension is not known.
 
     Warns:
         AccuracyWarning: if the estimated error exceeds 0.01.
@@ -138,11 +137,11 @@ def log_determinant(
     _, last = jax.lax.stop_gradient(positive_range(pairs))
     steps = 2.0 ** (np.arange(_TIMES) / _PER_DOUBLING)
     times = _FIRST / last * jnp.asarray(steps, dtype) if time is None else jnp.asarray(time, dtype)[None]
-    # Each of m times is multiplied by 1, √2, 2, 2√2, …; values at odd powers of √2 serve the error estimate.
+    # For each of m times T, values are computed at T, √2T, 2T, …. Extrapolations from T, √2T, 2T differ by the error.
     count = powers.size + 1
     doublings = 2.0 ** (np.arange(2 * count + 1) / 2)
     values = _at(pairs, a, d, times[:, None] * jnp.asarray(doublings, dtype)[None])
-    # The weights preserve constants (the power 0) and cancel the other powers.
+    # The weights of the values at T, 2T, 4T, … add up to 1, and cancel the powers of T in `extrapolate`.
     weights = np.linalg.solve(2.0 ** np.outer(np.append(0, powers), np.arange(count)), np.eye(count)[0])
     levels = [values[:, i : i + 2 * count : 2] @ jnp.asarray(weights, dtype) for i in range(3)]
     rest = jnp.maximum(jnp.abs(levels[0] - levels[1]), jnp.abs(levels[0] - levels[2]))
@@ -154,7 +153,7 @@ def log_determinant(
     if not is_traced(result) and not float(result.error) <= _DOUBTFUL:
         warn_of_accuracy(
             f"pairs: log det′ = {float(result.value):.4g} has the estimated error {float(result.error):.2g}. Use a "
-            "finer grid, more pairs or coefficients, or list in `extrapolate` the powers of t without a coefficient"
+            "finer grid, more pairs or more coefficients, or list the next powers of t in `extrapolate`"
         )
     return result
 

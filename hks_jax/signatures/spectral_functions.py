@@ -26,7 +26,7 @@ from hks_jax.traced import is_traced
 _ROWS = 128
 """The number of eigenvectors whose products with all others are computed at once, which limits the memory."""
 _SIZES = 8
-"""The number of allowed sizes for the pairs of one part of a doubled domain; each size is compiled separately."""
+"""The number of sizes for the eigenpairs of an even or odd problem of a doubled domain; each size is compiled."""
 _FILTERS = 8
 """The number of filters whose matrices (k, k) are computed and applied to the eigenvectors at once."""
 
@@ -34,10 +34,10 @@ _FILTERS = 8
 def spectral_diagonal(
     pairs: Eigenpairs, filters: Filter, scale: Float[Array, " m"] | None = None
 ) -> Float[Array, "m *shape"]:
-    """Return Σᵢ f(λᵢ) φᵢ(x)² for each of m filters, multiplied by its scale; NaN outside the mask."""
+    """Return Σᵢ f(λᵢ) φᵢ(x)² for each of m filters f, times the filter's entry of ``scale``; NaN outside the mask."""
     everywhere = pairs.on(on_all_nodes(pairs.pencil))
     diagonal = _kernel(Diagonal(), filters, everywhere)
-    # NaN is inserted last because the product 0·NaN would otherwise enter the derivatives of the scale.
+    # NaN is inserted after the multiplication, because 0·NaN would make the derivative with respect to ``scale`` NaN.
     nodal = everywhere.space.extend(diagonal if scale is None else scale[:, None] * diagonal)
     return nan_outside(nodal, pairs.space.domain)
 
@@ -63,9 +63,9 @@ def spectral_flow(
 ) -> Float[Array, "m s *shape"]:
     """Return Σᵢ f(λᵢ) φᵢ(x) ∫φᵢu for each of m filters and s functions u; NaN outside the mask.
 
-    Under "mirror" and "mean" the functions are extended evenly, like the metric.
+    Under "mirror" and "mean" functions are reflected to the doubled domain, as the metric is.
     """
-    # Each doubling of the domain doubles inner products of even functions; even and odd functions have the product 0.
+    # Each doubling of the domain doubles inner products of even functions. Even functions are orthogonal to odd ones.
     everywhere = pairs.on(on_all_nodes(pairs.pencil))
     parts, known = everywhere.pencil.parts, pairs.space.restrict(functions)
     functionals = len(parts) * parts[0].integrals(pairs.space.transfer(known, everywhere.space))
@@ -81,7 +81,7 @@ def spectral_trace(pairs: Eigenpairs, filters: Filter) -> Float[Array, " m"]:
 @jax.custom_jvp
 def _kernel(contraction: Contraction, filters: Filter, pairs: Eigenpairs) -> Array:
     """Return the contraction of the kernels Φ f(Λ) Φᵀ of m filters."""
-    # For second derivatives JAX differentiates this body instead of the rule. Second derivatives are not supported.
+    # Second derivatives, for which JAX would differentiate this function and not its rule, are not supported.
     pairs = first_order_only(pairs)
     return _weighted(contraction, _all_weights(filters, pairs.eigenvalues, pairs.kept), pairs.at_nodes)
 
@@ -91,23 +91,25 @@ def _weighted(contraction: Contraction, weights: Float[Array, "m k"], vectors: F
     return contraction.weighted(weights, vectors)
 
 
-# The kernel f(M⁻¹K)M⁻¹ is a smooth function of K and M even where the eigenvectors are not smooth. Let Φ have all n
-# eigenvectors. With G = Φᵀ dK Φ, H = Φᵀ dM Φ and divided differences of f (Daleckii and Krein 1965), the differential
-# of the kernel is Φ F Φᵀ, where
+# The kernel f(M⁻¹K)M⁻¹ is a smooth function of the matrices K and M even where the eigenvectors are not smooth. Let Φ
+# have all n eigenvectors, and let G = Φᵀ dK Φ and H = Φᵀ dM Φ. By the divided differences of f (Daleckii and Krein
+# 1965), the differential of the kernel is Φ F Φᵀ with the matrix
 #
 #     F = [f]∘G − [λf]∘H,    [f]ᵢⱼ = (f(λᵢ) − f(λⱼ))/(λᵢ − λⱼ),  [f]ᵢᵢ = f'(λᵢ),    [λf]ᵢⱼ = f(λᵢ) + λⱼ [f]ᵢⱼ.
 #
-# F does not depend on the basis chosen for a multiple eigenvalue, and is not singular there. Truncation sets f to zero
-# on all pairs that are not kept. Then the entries of F between kept pairs do not change. Between a kept pair i and all
-# other pairs j the entries f(λᵢ) (Gᵢⱼ − λᵢHᵢⱼ)/(λᵢ − λⱼ) add up to
+# The matrix F does not depend on the basis chosen for a multiple eigenvalue, and is finite. If only some pairs are
+# kept, f is set to zero on all others, and the entries of F between kept pairs do not change. The entries of F between
+# a kept pair i and all other pairs j are f(λᵢ) (Gᵢⱼ − λᵢHᵢⱼ)/(λᵢ − λⱼ). These entries add to the differential the sum
 #
 #     Σᵢ f(λᵢ) (φᵢxᵢᵀ + xᵢφᵢᵀ),    xᵢ = (I − ΦΦᵀM) dφᵢ,
 #
-# where xᵢ is the derivative of the frame (hks_jax/eigen/derivative.py). Pairs in the arrays that are not kept have
-# f = 0. Under "mirror" and "mean" the differential is the sum over the parts, whose pairs do not mix.
+# where Φ has only the kept eigenvectors, and xᵢ is the part of dφᵢ outside their span, the derivative of the frame
+# (hks_jax/eigen/derivative.py). Under "mirror" and "mean" the differential is the sum of the differentials of the even
+# and odd problems, whose eigenvectors do not mix.
 #
-# Let R map coefficients to values at the nodes (`Pencil.read`). Signatures use the kernel RΦ f(Λ) ΦᵀRᵀ. Then R
-# multiplies each φ and x from the left, and f(λᵢ) ((dR φᵢ)(Rφᵢ)ᵀ + (Rφᵢ)(dR φᵢ)ᵀ) is added to the sum.
+# Signatures use the kernel RΦ f(Λ) ΦᵀRᵀ, where the matrix R maps coefficients to values at the nodes (`Pencil.read`).
+# In the differential of this kernel, R multiplies each φᵢ and xᵢ from the left, and the derivative dR adds the terms
+# f(λᵢ) ((dR φᵢ)(Rφᵢ)ᵀ + (Rφᵢ)(dR φᵢ)ᵀ).
 @partial(_kernel.defjvp, symbolic_zeros=True)
 def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     (contraction, filters, pairs), (d_contraction, d_filters, d_pairs) = primals, tangents
@@ -140,9 +142,10 @@ def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 
 def _rows_of(pairs: Eigenpairs, number: int) -> tuple[Int[Array, " m"], Bool[Array, " m"]] | None:
-    """Return rows that include all pairs of one part of a doubled domain, and whether each row belongs to the part.
+    """Return numbers of rows that include the pairs of one part, and whether each row belongs to this part.
 
-    The number of rows is rounded up to one of few sizes. The result is None if the domain is not doubled.
+    Parts are the even and odd problems of a doubled domain; the result is None if no domain is doubled. The number of
+    rows is rounded up to one of `_SIZES` sizes.
     """
     if pairs.part is None:
         return None
@@ -157,7 +160,7 @@ def _rows_of(pairs: Eigenpairs, number: int) -> tuple[Int[Array, " m"], Bool[Arr
     return rows, own[rows]
 
 
-# The transpose recomputes intermediate results, because storing them would take twice the memory of the eigenvectors.
+# The transposed derivative recomputes intermediate results, which would take twice the memory of the eigenvectors.
 @jit_quickly(static_argnames=("fixed", "copies"), linear=("d_frame", "change"), shapes=shapes, numpy_rule=by_numpy)
 @partial(jax.checkpoint, static_argnums=(5, 6))
 def _tangent(
@@ -172,10 +175,10 @@ def _tangent(
     change: Pencil,
     reader: Pencil | None,
 ) -> Array:
-    """Return the derivative for the change of one part, given the part's pairs and the derivative of their frame."""
+    """Return the derivative of the contraction for the change of one pencil, given its pairs and their xᵢ (d_frame)."""
     values, vectors, kept, d_frame = (x if selection is None else x[selection[0]] for x in (*pairs, d_frame))
     if selection is not None:
-        vectors = jnp.where(selection[1][:, None], vectors, 0)  # pairs of different parts do not mix
+        vectors = jnp.where(selection[1][:, None], vectors, 0)  # eigenvectors of different problems do not mix
     if not len(vectors):
         return jnp.zeros_like(contraction.weighted(_all_weights(filters, values, kept), vectors))
     d_frame = jnp.where(kept[:, None], d_frame, 0)  # d_frame may be NaN where pairs are not kept

@@ -86,9 +86,9 @@ def _n_positive(pairs: Eigenpairs) -> int:
 def default_times(pairs: Eigenpairs, n: int = 16, decay: float = 1e-4) -> Float[Array, " n"]:
     """Return n times, log-spaced from 4 ln10/λ_last to 4 ln10/λ₁ (Sun, Ovsjanikov and Guibas 2009, section 5).
 
-    At the first time the last mode has decayed by the factor 1e-4. At the last time, which is not before the first, all
-    modes except the constant have decayed at least by the factor `decay`. The command line uses the decay 0.085; at the
-    last time √t is then half the length of an interval with the same λ₁.
+    At the first of the n times the mode of λ_last has decayed to the fraction 1e-4. At the last of the n times, which
+    is not before the first, all modes except the constant have decayed to at most the fraction `decay`. With the decay
+    0.33 of the command line, √t at the last time is a third of the length of an interval with the same eigenvalue λ₁.
 
     Examples:
         >>> times = hj.default_times(pairs, 3)
@@ -105,7 +105,7 @@ def default_times(pairs: Eigenpairs, n: int = 16, decay: float = 1e-4) -> Float[
 def default_energies(pairs: Eigenpairs, n: int = 100) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     """Return n energies and the width σ of the wave kernel signature (Aubry, Schlickewei and Cremers 2011).
 
-    Here σ = 7 (log λ_last − log λ₁)/n. The energies run from log λ₁ + 2σ to log λ_last − 2σ.
+    The width is σ = 7 (log λ_last − log λ₁)/n, and the energies run from log λ₁ + 2σ to log λ_last − 2σ.
 
     Examples:
         >>> energies, sigma = hj.default_energies(pairs)
@@ -128,9 +128,10 @@ DEFAULT_K = {2: 200, 3: 100}
 RESOLVED = {2: 4.6, 3: 5.7}
 """The least λ_k·t, by dimension, at which at most 1 % of the signature lies beyond k pairs (`hks_jax.truncation`)."""
 LAST = (math.pi / 2) ** 2
-"""The value of λ₁·t at the largest time, at which √t is half the length of an interval with the first eigenvalue λ₁."""
+"""The largest value of λ₁·t, at which √t is half the length of an interval with the first eigenvalue λ₁. At
+larger times, the signature mainly shows the size of the domain."""
 COARSE = 6.0
-"""The least t/h² at which the grid spacing h biases the signature by at most 1 %."""
+"""The least ratio t/h² of time to squared node spacing at which the grid biases the signature by at most 1 %."""
 
 
 def default_k(dimension: int, unknowns: int) -> int:
@@ -157,10 +158,11 @@ def suitable(metric: Any, spacing: Any, inside: Bool[np.ndarray, "*shape"], boun
 def suitable_times(
     dimension: int, volume: float, width2: float, size: float, nodes: int, problems: int = 1
 ) -> dict[str, float]:
-    """Return the least time that the spacing resolves, its k, the default k, its least time, and the largest time.
+    """Return a dictionary of times and numbers of eigenpairs that suit a domain.
 
-    `width2` is the squared distance between neighbouring nodes, and `size` is the domain's length. Under "mean" and
-    "mirror" several problems share the eigenpairs.
+    The node spacing resolves ``least_time``, which takes ``k_for_least_time`` eigenpairs; ``k``, the default number,
+    resolves ``least_time_of_k``. `width2` is the squared distance between neighbouring nodes, `size` the greatest
+    extent of the domain, and `problems` the number of even and odd problems under "mean" and "mirror".
     """
     least, unknowns = COARSE * width2, problems * nodes
     k = default_k(dimension, unknowns)
@@ -170,5 +172,5 @@ def suitable_times(
         "k": k,
         "unknowns": unknowns,
         "least_time_of_k": RESOLVED[dimension] / weyl(k, problems * volume, dimension),
-        "largest_time": LAST * (size / np.pi) ** 2,  # λ₁ of an interval of this length
+        "largest_time": LAST * (size / np.pi) ** 2,  # an interval of length `size` has λ₁ = (π/size)²
     }

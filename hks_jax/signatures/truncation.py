@@ -29,19 +29,19 @@ BIAS_LIMIT = 0.1
 
 
 class Truncation(eqx.Module):
-    """Error estimates for heat kernel signatures at given times, which derivatives treat as constants.
+    """Estimated errors of heat kernel signatures at given times; derivatives treat the estimates as constants.
 
     Attributes:
         times: (n,).
-        tail: (n,) the share of the heat trace beyond the k pairs, by Weyl's law. This share is a mean over the domain;
-            single nodes lack more (`truncation_map`).
+        tail: (n,) the share of the heat trace that the k computed pairs lack, by Weyl's law. The share is a mean over
+            the domain; the share that is missing at single nodes can be larger (`truncation_map`).
         resolution_bias: (n,) the relative discretisation error at the median node.
-        lasting_bias: (n,) the part of `resolution_bias` that does not decrease with t, from tensors that turn or
-            stretch.
+        lasting_bias: (n,) the part of `resolution_bias` that does not decrease with t: the error where eigenvectors or
+            eigenvalues of the tensors vary between nodes.
         coarse_fraction: (n,) the fraction of nodes where the discretisation error exceeds 10 %.
-        smallest_time: the least time at which `tail` is at most 1 %. The worst node then lacks up to 6 %, or 20 %
-            beside a Dirichlet side.
-        order: the power of 1/t with which the rest of the discretisation error decreases.
+        smallest_time: the least time at which `tail` is at most 1 %, and at which the worst node lacks up to 6 % of its
+            signature, or up to 20 % beside a Dirichlet side.
+        order: the part of the discretisation error that decreases with t is proportional to t^(−order).
     """
 
     times: Float[Array, " n"]
@@ -76,7 +76,7 @@ class Truncation(eqx.Module):
         if early.any():
             at = np.argmax(np.where(early, bias, 0))
             first = times[at]
-            # The estimate is x/(1 + x) with x² = (a/t)^(2·order) + c², where c is constant (see `_resolution_bias`).
+            # The bias is x/(1 + x), where x² = (a/t)^(2·order) + c² with constants a and c (see `_resolution_bias`).
             x, c, limit = (each / (1 - each) for each in (min(bias[at], 1 - 1e-15), lasting[at], BIAS_LIMIT))
             least = first * ((x**2 - c**2) / max(limit**2 - c**2, 1e-6)) ** (0.5 / self.order)
             messages.append(
@@ -86,9 +86,9 @@ class Truncation(eqx.Module):
             )
         if (lasting > BIAS_LIMIT).any():
             messages.append(
-                "the tensors turn or stretch too much from node to node: the discretisation biases the signature at "
-                f"{int((lasting > BIAS_LIMIT).sum())} of {times.size} times by about {lasting.max():.1%}, which does "
-                'not decrease with t. Use a finer grid; interpolation="log-euclidean" at least preserves the volume'
+                "the tensors vary too much from node to node: the discretisation biases the signature at "
+                f"{int((lasting > BIAS_LIMIT).sum())} of {times.size} times by about {lasting.max():.1%}, which larger "
+                'times do not reduce. Use a finer grid; interpolation="log-euclidean" at least preserves the volume'
             )
         return messages
 
@@ -97,17 +97,18 @@ class Truncation(eqx.Module):
 def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]) -> Truncation:
     """Estimate the truncation error of k pairs and the discretisation error of the signature at each time.
 
-    Weyl's law N(λ) = k (λ/Λ)^(d/2), where Λ is the first eigenvalue beyond the k pairs, gives the part of the heat
-    trace beyond Λ. This part is a mean over the domain; `truncation_map` estimates the error at each node.
+    By Weyl's law, k (λ/Λ)^(d/2) eigenvalues are below λ, where Λ is the first eigenvalue beyond the k pairs. The law
+    gives the share of the heat trace from eigenvalues above Λ; `truncation_map` estimates this share at each node.
 
-    The discretisation error has two parts of leading order in the spacing h. The first part is d h²/48t for a constant
-    metric that is diagonal in the grid's axes, and larger for other metrics. The second part does not decrease with t:
-    where tensors turn or stretch between nodes, elements are too stiff and the interpolated tensors have another
-    volume. With enough pairs the measured median error on such fields was 1/3 to 3 times the estimate, and 1/4 of the
-    estimate for eigenvalue ratios of 30 on coarse grids. On meshes only the first part is estimated.
+    The discretisation error has a part that decreases with t and a part that does not. For node spacing h, the
+    decreasing part of the error is d h²/48t if the metric is constant and diagonal in the grid's axes, and larger
+    otherwise. The lasting part of the error arises where the tensors vary between nodes: the elements overestimate
+    eigenvalues, and interpolation changes the volume. On fields of varying tensors with enough pairs, the measured
+    median error was 1/3 to 3 times the estimate; for eigenvalue ratios of 30 on coarse grids it was 1/4 of the
+    estimate. On meshes only the decreasing part of the error is estimated.
 
-    With a potential or an unknown null space, the mean of the eigenvalues gives an exponent, which replaces d/2 if it
-    is larger. The discretisation error is then NaN, as it is for matrices without a node spacing.
+    With a potential or an unknown null space, the exponent of Weyl's law is estimated from the mean of the eigenvalues,
+    if this gives more than d/2, and the discretisation error is NaN. The error is also NaN for unknown node spacing.
 
     Raises:
         ValueError: if times are not positive and finite, pairs lie in an interval, or the dimension is not known.
@@ -140,7 +141,6 @@ def _truncation(
     by_weyl: bool,
     order: int,
 ) -> tuple[Any, ...]:
-    """Return the fields of `Truncation` except the times, by Weyl's exponent d/2 or the spectrum's exponent."""
     # Weyl's law counts from the bottom of the spectrum, which a potential shifts.
     values, next_eigenvalue = values - bottom, next_eigenvalue - bottom
     complete = xp.isinf(next_eigenvalue)
@@ -148,7 +148,7 @@ def _truncation(
     count = xp.sum(kept, dtype=at.dtype)
     if by_weyl:
         left, least = beyond_by_weyl(xp, count, dimension, following * at), resolving(TAIL_LIMIT, dimension)
-    else:  # the midpoint between two levels, because there may be few levels
+    else:  # Λ lies midway between the last and the next eigenvalue, because there may be few eigenvalues
         following = (following + xp.max(xp.where(kept, values, 0))) / 2
         mean = xp.sum(xp.where(kept, values, 0)) / (count * following)
         exponent = xp.maximum(_exponent(xp, mean), dimension / 2)
@@ -168,30 +168,27 @@ def _truncation(
     return tail, median_of_shares(xp, bias, free), median_of_shares(xp, lasting, free), coarse, smallest
 
 
-# If all eigenvalues are larger by the factor 1 + δ, the heat trace Z(t) becomes Z((1 + δ)t). The relative error is
-# proportional to s = −(2/d) d log Z/d log t, which is 1 at small t and 0 where only the constant function is left. If
-# the volume is larger by the factor 1 + v, the metric is larger by the factor (1 + v)^(2/d). This divides the signature
-# by 1 + v and the eigenvalues by (1 + v)^(2/d): a relative error of size v(1 − s). The truncated part of the trace has
-# s = 1.
+# If all eigenvalues grow by the factor 1 + δ, the heat trace Z(t) becomes Z((1 + δ)t). The relative change of Z is
+# proportional to δ and to the slope s = −(2/d) d log Z/d log t, which is 1 at small t and 0 at times at which only the
+# constant function contributes. If the volume grows by the factor 1 + v, the metric grows by the factor (1 + v)^(2/d).
+# The signature is divided by 1 + v and the eigenvalues by (1 + v)^(2/d), with a relative error of size v(1 − s). The
+# truncated part of the heat trace has the slope s = 1.
 def _resolution_bias(
     xp: Any, errors: tuple[Any, Any, Any], free: Any, times: Any, slope: Any, order: int
 ) -> tuple[Any, Any]:
-    """Return the estimated relative discretisation error (n, nodes) and its part that does not decrease with t.
-
-    Both numbers are 0 at nodes that are not free.
-    """
+    """Return the estimated relative discretisation error (times, nodes), and its part that does not decrease with t."""
     dispersion, turning = (xp.where(free, x, 0).ravel() for x in errors[:2])
     lasting = slope[:, None] * turning[None] + (xp.abs(1 - slope) * errors[2])[:, None]
     lasting = xp.where(free.ravel()[None], lasting, 0)
     both = xp.hypot((dispersion[None] / times[:, None]) ** order, lasting)
-    # Discrete signatures stay bounded as t tends to 0, so their relative error tends to 1.
+    # The signature of the discretised domain stays bounded as t tends to 0, so its relative error tends to 1.
     return both / (1 + both), lasting / (1 + lasting)
 
 
 def median_of_shares(xp: Any, x: Any, free: Any) -> Any:
-    """Return the medians (n,) over the free nodes of numbers (n, nodes) in [0, 1]; the numbers are 0 at other nodes.
+    """Return the median over the free nodes of each row of x (n, nodes), whose entries are in [0, 1], and 0 elsewhere.
 
-    The accuracy is 1e-12. The median of numbers with a NaN is NaN. Bisection is ten times as fast as sorting in JAX.
+    The accuracy is 1e-12. The median of a row with a NaN is NaN. Bisection is ten times as fast as sorting in JAX.
     """
     twice_half = 2 * free.size - xp.sum(free)
 
@@ -206,7 +203,7 @@ def median_of_shares(xp: Any, x: Any, free: Any) -> Any:
 
 
 def _estimated(pairs: Eigenpairs, times: Any) -> tuple[Eigenpairs, Float[Array, " n"]]:
-    """Return pairs and times as constants to derivatives; raise ValueError if the pairs allow no estimate."""
+    """Return pairs and times as constants for derivatives; raise ValueError if the pairs are not the lowest."""
     at = times_of(pairs, times)
     if not pairs.lowest:
         raise ValueError("pairs: got eigenpairs in an interval; truncation can be estimated only for the lowest pairs")
@@ -214,7 +211,7 @@ def _estimated(pairs: Eigenpairs, times: Any) -> tuple[Eigenpairs, Float[Array, 
 
 
 def resolved_times(pairs: Eigenpairs, times: Any) -> Float[Array, " n"]:
-    """Return times as `times_of` does, with an AccuracyWarning if k or the spacing does not resolve some of them.
+    """Return times as `times_of` does; warn if the pairs or the node spacing do not resolve some of the times.
 
     No warning is issued if values are traced, if pairs lie in an interval (their sums are band-limited on purpose), or
     if the dimension of the manifold is not known.
@@ -235,16 +232,16 @@ _POINTS, _WEIGHTS = np.polynomial.laguerre.laggauss(24)
 """The points and weights of Gauss–Laguerre quadrature, for integrals of f(u) e^(−u) from 0 to ∞."""
 
 
-# If N(λ) = N(Λ) (λ/Λ)^a eigenvalues are below λ, the part of the heat trace beyond Λ is
+# Let N(λ) = N(Λ) (λ/Λ)^a be the number of eigenvalues below λ. The eigenvalues above Λ contribute to the heat trace
 #
 #     ∫_Λ^∞ e^(−λt) dN = N(Λ) a (Λt)^(−a) ∫_Λt^∞ e^(−y) y^(a−1) dy = N(Λ) (a/x) e^(−x) ∫_0^∞ (1 + u/x)^(a−1) e^(−u) du
 #
-# with x = Λt and y = x + u. JAX's incomplete gamma function, which is the integral in the middle, takes ten times as
-# long to compile and thirty times as long to run.
+# with x = Λt, y = λt and u = y − x. The code computes the integral over u by quadrature. JAX's incomplete gamma
+# function, which is the integral over y, takes ten times as long to compile and thirty times as long to run.
 def beyond(count: Float[Array, "..."], exponent: Float[Array, "..."], x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return ∫ e^(−λt) dN over λ > Λ, with N(λ) = count · (λ/Λ)^exponent and x = Λt.
+    """Return the heat trace ∫ e^(−λt) dN of eigenvalues λ > Λ, where N(λ) is count · (λ/Λ)^exponent and x is Λt.
 
-    The accuracy for exponents from ½ to 8 is 1e-3 for x ≥ 0.1 and 1e-7 for x ≥ 1. Values x < 1e-3 are replaced by 1e-3.
+    The accuracy for exponents from ½ to 8 is 1e-3 for x ≥ 0.1 and 1e-7 for x ≥ 1. An x below 1e-3 is replaced by 1e-3.
     """
     x = jnp.maximum(x, 1e-3)  # prevents overflow
     count, exponent = (jnp.expand_dims(each, tuple(range(x.ndim - each.ndim))) for each in (count, exponent))
@@ -258,7 +255,7 @@ def beyond(count: Float[Array, "..."], exponent: Float[Array, "..."], x: Float[A
     return count * exponent / x * jnp.exp(-x) * integral
 
 
-# The integral over u is 1 for a = 1. For a = 3/2, integration by parts gives 1 + (√π/2) erfc(√x) e^x/√x.
+# The integral over u in `beyond` is 1 for a = 1 and, by parts, 1 + (√π/2) erfc(√x) e^x/√x for a = 3/2.
 def beyond_by_weyl(xp: Any, count: Any, dimension: int, x: Any) -> Any:
     """Return `beyond` for Weyl's exponent d/2, where d is 2 or 3."""
     if dimension == 2:
@@ -273,7 +270,7 @@ def resolving(share: float, dimension: int) -> float:
 
 
 def _exponent(xp: Any, mean: Any) -> Any:
-    """Return the exponent of a counting function from the mean of λ/Λ below Λ."""
+    """Return the exponent a of the law N(λ) = N(Λ) (λ/Λ)^a, given the mean a/(a + 1) of λ/Λ over the λ below Λ."""
     return xp.clip(mean / xp.maximum(1 - mean, 1e-3), float(_EXPONENTS[0]), float(_EXPONENTS[-1]))
 
 
@@ -281,17 +278,18 @@ def _exponent(xp: Any, mean: Any) -> Any:
 def truncation_map(
     pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n_times"]
 ) -> Float[Array, "n_times *shape"]:
-    """Estimate the share of the heat kernel signature beyond the k pairs at each node.
+    """Estimate the share of the heat kernel signature that the k computed pairs lack at each node.
 
-    `truncation` estimates the mean over the domain. A single node beside a Dirichlet side, in its corners, or where
-    tensors vary between nodes can lack several times as much. Here Weyl's law is local: the function N(λ, x) = Σ φᵢ(x)²
-    over λᵢ < λ is approximated by N(Λ, x) (λ/Λ)^a(x), where Λ is the first eigenvalue beyond the k pairs. The pairs
-    determine N(Λ, x). The mean of λᵢ with the weights φᵢ(x)² equals Λ a/(a + 1), so it determines a(x). The exponent is
-    about d/2 inside and at Neumann sides, and d/2 + 1 at a Dirichlet side.
+    `truncation` estimates the mean of this share over the domain. The share can be several times the mean at single
+    nodes: beside a Dirichlet side, in its corners, or where tensors vary between nodes. Weyl's law is applied to each
+    node x: the sum N(λ, x) of φᵢ(x)² over the eigenvalues below λ is approximated by N(Λ, x) (λ/Λ)^a, where Λ is the
+    first eigenvalue beyond the k pairs. The pairs determine N(Λ, x) and the exponent a at each node, because the mean
+    of the eigenvalues with the weights φᵢ(x)² is Λ a/(a + 1). The exponent a is about d/2 inside the domain and at
+    Neumann sides, and d/2 + 1 at a Dirichlet side.
 
-    The result is an estimate, not a bound. On small grids the largest true share of a node was 0.25 to 2 times the
-    largest estimate if the mean share exceeded 0.1 %, and up to 3 times the estimate if the mean was 1e-6. The result
-    is NaN outside the mask, and 0 at Dirichlet nodes or if no pairs are left out. Derivatives treat it as constant.
+    The result is an estimate, not a bound. On small grids, the largest true share over the nodes was 0.25 to 2 times
+    the largest estimate if the mean share exceeded 0.1 %, and up to 3 times if the mean share was 1e-6. The result is
+    NaN outside the mask, 0 at Dirichlet nodes or if no pairs are left out, and constant in derivatives.
 
     Args:
         times: (n_times,) positive, in (metric length)².

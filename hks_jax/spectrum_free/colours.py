@@ -1,4 +1,4 @@
-"""Colouring: the spacing of sources and the degree of the expansion that a given tolerance needs."""
+"""The settings of the colouring method: from a tolerance follow the sources' spacing and the polynomial's degree."""
 
 import math
 from dataclasses import dataclass
@@ -14,30 +14,30 @@ from hks_jax.linear.chebyshev import coefficient_tails, least_degree
 from hks_jax.spectrum_free.spectrum_bounds import Bounds
 
 _STEEPEST = 0.9
-"""The bound uses this share of the steepest decay rate of M⁻¹. A share near 1 gives the bound a large factor."""
+"""The share of the steepest decay rate of M⁻¹ in `reach_bound`; a share near 1 gives the bound a large factor."""
 
 
 @dataclass(frozen=True)
 class Colouring:
-    """The static settings of the probing in `hks_spectrum_free`, which `colouring` computes from a field and times.
+    """The static settings of colouring in `hks_spectrum_free`, which `colouring` computes from a field and times.
 
-    Sources of one colour are ``spacing`` nodes apart along each axis. On a periodic axis some of these distances are
-    slightly larger, so that they add up to the length of the axis.
+    Point sources of one colour are ``spacing`` nodes apart along each axis, and processed together as one vector. On a
+    periodic axis some sources are slightly farther apart, so that the distances add up to the length of the axis.
 
     Attributes:
-        spacing: the distance between sources on each axis, in nodes; n or more for one source on an axis of n nodes.
+        spacing: the distance between a colour's sources on each axis, in nodes; n or more for one source on n nodes.
         degree: the degree of the Chebyshev expansion in M⁻¹K.
         mass_degree: the degree of the polynomial approximation of M⁻¹; 1 for a lumped mass, which is inverted exactly.
         columns: the number of colours that are processed at once.
-        top: the upper bound on the eigenvalues for which the expansion is made.
-        low: the lower bound on the eigenvalues of D⁻¹M, where D has the row sums of M.
+        top: the upper bound on the eigenvalues of M⁻¹K for which the expansion is made.
+        low: the lower bound on the eigenvalues of D⁻¹M, where the diagonal matrix D holds the row sums of M.
         reach: `Bounds.reach` for each axis, times the longest time.
         across: `Bounds.across` for each axis.
-        error: an error bound at each time that includes rounding, relative to the smaller of (4πt)^(−d/2) and the
-            largest possible value at a node. For a lumped mass the bound holds unless `top` is too small, which has the
-            probability 10⁻⁶. For a consistent mass the bound is proven to first order in the error of the polynomial
-            for M⁻¹, for t → 0 and for a constant metric. For varying metrics, measured errors were at most a fiftieth
-            of the bound.
+        error: for each time, a bound on the signature's error, including rounding errors, relative to the smaller of
+            (4πt)^(−d/2) and the largest possible value at a node. For a lumped mass the bound holds unless `top` is too
+            small, which has the probability 10⁻⁶. For a consistent mass the bound is proven to first order in the error
+            of the polynomial for M⁻¹, for t → 0 and for a constant metric. For varying metrics, measured errors were at
+            most a fiftieth of the bound.
     """
 
     spacing: tuple[int, ...]
@@ -69,18 +69,19 @@ class Colouring:
 
 
 def reach_bound(distance: Any, reach_time: Any, low: float, across: float) -> Any:
-    """Return a bound on √(D_x D_y) times the kernel of nodes x, y at this distance along an axis; D has M's row sums.
+    """Return a bound on √(D_x D_y) times the heat kernel of two nodes x, y at a given distance along an axis.
 
-    Davies' method uses weights exp(ψ) with ψ = αi at node i along the axis. Let A = D^(−½)KD^(−½), let κ be the reach,
-    and let s be the distance. Then ‖exp(ψ) exp(−tA) exp(−ψ)‖ ≤ exp(t κ (cosh α − 1)): only the symmetric part of the
-    weighted K matters, in which couplings across the axis are multiplied by cosh α. So the kernel is at most exp(−αs +
-    tκ (cosh α − 1)), whose minimum is at sinh α = s/tκ. This is the Gaussian kernel exp(−s²/2tκ) for s ≪ tκ and the
-    decay of a random walk for s ≫ tκ.
+    The diagonal matrix D holds the row sums of M. Davies' method weights node i along the axis by exp(ψ) with ψ = αi.
+    For A = D^(−½)KD^(−½) and the reach κ of `Bounds`, ‖exp(ψ) exp(−tA) exp(−ψ)‖ ≤ exp(t κ (cosh α − 1)): only the
+    symmetric part of exp(ψ) K exp(−ψ) matters, in which couplings across the axis are multiplied by cosh α. At the
+    distance s, the heat kernel is therefore at most exp(−αs + tκ (cosh α − 1)), which is least for sinh α = s/tκ. The
+    least bound is close to the Gaussian kernel exp(−s²/2tκ) for s ≪ tκ, and to the decay of a random walk for s ≫ tκ.
 
-    A consistent mass M has a nonlocal inverse. The symmetric part of the weighted M is M + (cosh α − 1) C, where C has
-    the couplings across the axis and −C ⪯ βM. So this part is at least low (1 − β (cosh α − 1)) D, and entries of M⁻¹
-    are at most exp(−αs) divided by the factor of D. The product of both bounds is a bound for t → 0 and for a constant
-    metric. For varying metrics and other times the product is not a proven bound.
+    A consistent mass M has a nonlocal inverse. The symmetric part of exp(ψ) M exp(−ψ) is M + (cosh α − 1) C, where C
+    holds the couplings of M across the axis and −C ⪯ βM, and so at least low (1 − β (cosh α − 1)) D. Entries of M⁻¹
+    between nodes at the distance s are therefore at most exp(−αs) divided by low (1 − β (cosh α − 1)) D. The product of
+    the bounds on exp(−tA) and M⁻¹ is a bound on the heat kernel for t → 0 and for a constant metric. For varying
+    metrics at other times t, it is not a proven bound.
     """
     s = np.asarray(distance, float)
     alpha = np.arcsinh(s / reach_time)
@@ -92,24 +93,21 @@ def reach_bound(distance: Any, reach_time: Any, low: float, across: float) -> An
 
 
 def _unit(time: float, limits: Bounds, dimension: int) -> float:
-    """Return the unit of errors times the least row sum of M.
-
-    The unit is the diagonal of the flat kernel, or the least inverse row sum if the grid does not resolve the time.
-    """
+    """Return the unit of errors, the smaller of (4πt)^(−d/2) and 1/(M's greatest row sum), times M's least row sum."""
     return limits.least_mass * min((4 * math.pi * time) ** (-dimension / 2), 1 / limits.greatest_mass)
 
 
 def error_bound(spacing: tuple[int, ...], degree: int, time: float, limits: Bounds, space: GridSpace) -> float:
-    """Return a bound on the error at one time, relative to the unit of errors.
+    """Return a bound on the error of the signature at one time, relative to the unit that `_unit` defines.
 
-    The bound is the sum of the expansion's tail and the contributions of the other sources of a colour. A contribution
-    is the kernel at the source's distance. For a lumped mass, this kernel is at most the expansion's tail from the
-    degree that equals the distance in nodes, because polynomials of lower degree do not couple the two nodes.
+    At each node, the bound adds the tail of the Chebyshev expansion and the heat kernel between the node and each other
+    source of its colour. For a lumped mass, the heat kernel between two nodes is at most the expansion's tail from the
+    degree that equals their distance in nodes, because polynomials of lower degree do not couple the two nodes.
     """
     low, d = limits.low, space.dimension
     tails = coefficient_tails(time * limits.top / 2)
     beyond = float(tails[min(degree + 1, tails.size - 1)])
-    # The distances of the sources of one colour along each axis, in spacings. All distances but 0 occur twice.
+    # The distances in nodes, along each axis, between sources of one colour. All distances but 0 occur twice.
     of_axes = zip(space.node_shape, spacing, space.periodic, strict=True)
     steps = [np.arange(max(n // s, 1) // 2 + 1 if wraps else -(-n // s)) for n, s, wraps in of_axes]
     distances = [s * along for s, along in zip(spacing, steps, strict=True)]
@@ -129,10 +127,11 @@ def error_bound(spacing: tuple[int, ...], degree: int, time: float, limits: Boun
 def mass_error(mass_degree: int, time: float, limits: Bounds, dimension: int) -> float:
     """Return a bound, to first order in ε, on the relative error due to the approximation P = p(D⁻¹M)D⁻¹ of M⁻¹.
 
-    Let ε = max |1 − μ p(μ)| over the eigenvalues μ of D⁻¹M, w = M^(−½)e_x, S = M^(−½)KM^(−½), P = M^(−½)(1 − E)M^(−½).
-    Then ‖E‖ ≤ ε. Duhamel's formula, with integration by parts at small times, bounds the error by 4.5 ε ‖w‖
-    ‖exp(−St/4)w‖ = 4.5 ε √((M⁻¹)ₓₓ HKS(t/2, x)). Both factors are at most 1/(low D). The result is relative to the unit
-    of errors.
+    The polynomial p has the error ε = max |1 − μ p(μ)| over the eigenvalues μ of D⁻¹M. In P = M^(−½)(1 − E)M^(−½), the
+    norm of the matrix E is at most ε. For a node x, with w = M^(−½)e_x and S = M^(−½)KM^(−½), Duhamel's formula and, at
+    small times, integration by parts bound the error of the signature by 4.5 ε ‖w‖ ‖exp(−St/4)w‖ = 4.5 ε √((M⁻¹)ₓₓ
+    HKS(t/2, x)). Since low is the least eigenvalue of D⁻¹M or less, (M⁻¹)ₓₓ and HKS(t/2, x) are at most 1/(low D). The
+    returned bound is relative to the unit that `_unit` defines.
     """
     low = limits.low
     if low == 1:
@@ -142,10 +141,11 @@ def mass_error(mass_degree: int, time: float, limits: Bounds, dimension: int) ->
 
 
 def rounding_error(time: float, limits: Bounds, dimension: int, eps: float) -> float:
-    """Return an estimate of the rounding error of the signature, relative to the unit of errors.
+    """Return an estimate of the rounding error of the signature, relative to the unit that `_unit` defines.
 
-    The vectors of the recurrence are as large as M⁻¹ at their source, at most 1/(low D), and the row sums D of M are
-    rounded. Measured errors did not grow with the degree and were 0.05 to 0.7 times this estimate in float32.
+    The vectors of the Chebyshev recurrence have entries of up to 1/(low D), like M⁻¹, and their rounding gives the term
+    1/low of the estimate. The rounding of the row sums D of M gives the term 1 of the estimate. Measured rounding
+    errors did not grow with the degree of the expansion, and were 0.05 to 0.7 times the estimate in float32.
     """
     return eps * (1 + 1 / limits.low) / _unit(time, limits, dimension)
 
@@ -167,7 +167,7 @@ def choose(
     def least(time: float, share: float) -> int:
         return least_degree(time * limits.top / 2, share * tolerance * _unit(time, limits, d))
 
-    # The tail adds to the error once for each source in reach: the node and its 3ᵈ − 1 neighbours of the same colour.
+    # The expansion's tail counts 3ᵈ times: for the node itself, and for the nearest sources of the same colour.
     degree = max(1, *(least(time, 0.05 * low / 3**d) for time in times))
     spacing = (1,) * d
     for time in times:
@@ -180,7 +180,7 @@ def choose(
             allowed /= 2
         spacing = tuple(map(max, spacing, trial))
     if low == 1:
-        # Alternatively, a spacing that exceeds the degree of the expansion excludes contributions of other sources.
+        # With a lumped mass, a spacing above the degree of the expansion excludes all contributions of other sources.
         shortest = max(least(time, 1.0) for time in times)
         apart = tuple(min(shortest + 1, n) for n in shape)
         if math.prod(apart) <= math.prod(spacing):

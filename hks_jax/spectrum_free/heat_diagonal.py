@@ -39,28 +39,30 @@ def hks_spectrum_free(
 
     The result equals the signature of all eigenpairs of the discretisation, at any t. For node spacing h, the cost of
     colouring grows with t/h², whereas the cost of eigenpairs falls; selected inversion costs the same at any t.
-    docs/spectrum-free.md derives the bounds. The unit is 1/(metric length)^d. Values are NaN outside the mask, 0 at
-    Dirichlet nodes, and all NaN if a given `Colouring` was made for a smaller largest eigenvalue, or for shorter times.
+    docs/spectrum-free.md derives the bounds. The unit is 1/(metric length)^d. Values are NaN outside the mask, and 0 at
+    Dirichlet nodes. All values are NaN if times or the largest eigenvalue exceed those for which a given `Colouring`
+    was made.
 
     Args:
         domain: a tensor field on a grid, a mesh of triangles or tetrahedra, or a pencil of either from `assemble`.
         times: (n_times,) positive, in (metric length)².
         boundary: see `assemble`; to be omitted if a pencil is given.
-        mass: see `assemble`. With colouring, ``"lumped"`` is 50 to 100 times as fast.
+        mass: see `assemble`. Colouring is 50 to 100 times as fast with ``"lumped"`` as with ``"consistent"``.
         method: ``"colouring"`` (on grids) applies Chebyshev polynomials to sums of distant point sources, with the same
             vectors for all times. ``"selected-inversion"`` uses a rational approximation with an error of about 1e-10.
-            For n nodes each time takes O(n^1.5) operations in 2D, O(n²) in 3D, and memory for complex factors.
-            ``"auto"`` chooses the method with less work. Under `jax.jit`, colouring needs a `Colouring` from
-            `colouring`.
+            For n nodes, selected inversion takes O(n^1.5) operations per time in 2D and O(n²) in 3D, and keeps complex
+            factors in memory. ``"auto"`` chooses the method with less work. Under `jax.jit`, colouring needs a
+            `Colouring` from `colouring`.
         tolerance: a bound on the error of colouring at every node, relative to the smaller of (4πt)^(−d/2) and the
-            largest possible value at a node; with a potential, times exp(−vt), where v is the potential's least value.
+            largest possible value at a node. A potential with the least value v multiplies the bound by exp(−vt).
             `Colouring.error` contains the proven bound. Selected inversion ignores the tolerance.
 
     Raises:
-        ValueError: if times, tolerance or method are invalid, if the tolerance is below the rounding error, or a time
-            is so large that colouring takes about as many vectors as nodes (``"auto"`` then uses selected inversion if
-            memory suffices), if ``"auto"`` takes more than 8 GB on a mesh, or if `jax.jit` lacks a `Colouring`.
-        TypeError: if colouring is used on a mesh.
+        ValueError: invalid times, tolerance or method; a tolerance below the rounding error; a time so large that
+            colouring takes about as many vectors as there are nodes (``"auto"`` then uses selected inversion if memory
+            suffices); ``"auto"`` on a mesh, if selected inversion takes more than 8 GB; colouring under `jax.jit`
+            without a given `Colouring`.
+        TypeError: colouring on a mesh.
 
     Examples:
         >>> np.allclose(hj.hks_spectrum_free(field, [0.5]), hj.hks(pairs, [0.5]), atol=1e-4)
@@ -72,7 +74,7 @@ def hks_spectrum_free(
     settings = choose_method(pencil, times, method, tolerance)
     scale, given = jnp.exp(-origin * times), isinstance(method, Colouring)
     values = [_diagonal(part, times, settings, scale, checked=given) for part in pencil.parts]
-    # On a doubled domain a point source is half the sum of an even and an odd function.
+    # The mean over even and odd parts is the signature: a point source is half the sum of an even and an odd function.
     return jnp.mean(jnp.stack(values), axis=0)
 
 
@@ -85,16 +87,16 @@ def colouring(
     memory: float = 2e9,
     slack: float = 1.0,
 ) -> Colouring:
-    """Choose the spacing of sources and the degree of the expansion for `hks_spectrum_free` from the error bound.
+    """Choose the spacing of point sources and the degree of the Chebyshev expansion for `hks_spectrum_free`.
 
     Args:
-        memory: the maximum size of the working vectors in bytes, which limits the number of vectors at once.
-        slack: a factor ≥ 1 by which spectrum and reach may grow, for example in later fields of a fit.
+        memory: the maximum size of the working vectors in bytes, which limits the number of vectors in use at once.
+        slack: a factor ≥ 1 by which the largest eigenvalue and the reach of heat may grow, as in later fields of a fit.
 
     Raises:
-        ValueError: if arguments are invalid, if the tolerance is below the rounding error, if values are traced, or if
-            about as many vectors as nodes are needed.
-        TypeError: if the domain is a mesh.
+        ValueError: an invalid argument; a tolerance below the rounding error; traced values; colouring that takes about
+            as many vectors as there are nodes.
+        TypeError: a domain that is a mesh.
 
     Examples:
         >>> colours = hj.colouring(field, [0.05], mass="lumped", tolerance=1e-4)
@@ -122,7 +124,7 @@ def _read_as_unknowns(pencil: AnyPencil) -> AnyPencil:
 def _diagonal(
     part: Pencil, times: Float[Array, " m"], settings: Colouring | None, scale: Float[Array, " m"], checked: bool
 ) -> Float[Array, "m *shape"]:
-    # Scale before NaN is inserted, because NaN would enter the derivatives of the scales as 0·NaN.
+    # Values are scaled before NaN is inserted, because NaN would enter the derivatives of the scales as 0·NaN.
     space = part.space
     if settings is None:
         diagonals = selected_inversion(part.stiffness, part.mass, times, dissect(part.pattern))
@@ -143,7 +145,6 @@ def _by_colours(settings: Colouring, part: Pencil, times: Float[Array, " m"]) ->
 
 
 def _fits(settings: Colouring, part: Pencil, times: Float[Array, " m"]) -> Array:
-    """Return whether the settings are valid for this pencil and these times."""
     low = jnp.asarray(settings.low, times.dtype)
     actual, rounding = bounds(part, low, settings.mass_degree), 1.001
     fits = actual.top <= rounding * settings.top

@@ -1,4 +1,4 @@
-"""The choice of the spectrum-free method and its settings with the least work."""
+"""The choice between colouring and selected inversion, and the settings of colouring that take the least work."""
 
 import math
 from collections.abc import Sequence
@@ -22,14 +22,14 @@ from hks_jax.traced import is_traced
 Method = Literal["auto", "colouring", "selected-inversion"] | Colouring
 
 _LARGE = 4096
-"""The largest number of nodes for which one vector per node is acceptable."""
+"""The number of free nodes up to which colouring may take as many vectors as there are nodes."""
 _COLUMNS = 16
 _FASTER = 3.0
-"""The speed of dense products relative to stencils, per operation."""
+"""The number of operations of dense products that take as long as one operation of a stencil."""
 _MEMORY = 8e9
 """The memory in bytes above which selected inversion is not chosen automatically."""
 _FILL = {2: 150, 3: 40}
-"""Lower bounds, by dimension d, on the number of a factor's entries divided by n^(2 − 2/d), for large n."""
+"""Lower bounds, for each dimension d, on a factor's number of entries over n^(2 − 2/d), for large numbers n of rows."""
 
 
 def require_grid(pencil: AnyPencil) -> None:
@@ -126,8 +126,8 @@ def plan(
         more = next(i for i, error in enumerate(errors) if error <= (tolerance - rounding) / 2)
         if not more:
             break
-        mass_degree += more  # repeat, because the upper bound `top` depends slightly on the degree
-    # Values need five blocks of vectors in memory, and derivatives need eight.
+        mass_degree += more  # the loop repeats, because `top` depends slightly on this degree
+    # The signature needs five blocks of vectors in memory, and the derivatives of the signature need eight.
     columns = int(min(_COLUMNS, max(1, memory // (8 * space.free.size * times.dtype.itemsize))))
     settings = choose(concrete, limits, space, tolerance, mass_degree, columns, eps)
     vectors = settings.n_vectors(space)
@@ -142,17 +142,13 @@ def plan(
 
 
 def _widest(limits: Sequence[Bounds], slack: float) -> Bounds:
-    """Return NumPy bounds that hold for all parts."""
     stacked = Bounds(*(np.stack(values).astype(float) for values in zip(*limits, strict=True)))
     top, reach, across = (slack * x.max(axis=0) for x in (stacked.top, stacked.reach, stacked.across))
     return Bounds(top, stacked.low.min(), reach, across, stacked.least_mass.min(), stacked.greatest_mass.max())
 
 
 def work(settings: Colouring | None, pencil: AnyPencil, times: Float[Array, " m"]) -> float:
-    """Estimate the work of a method, in floating-point operations of stencils.
-
-    The work of selected inversion is infinite if it needs more memory than an automatic choice may.
-    """
+    """Estimate a method's work in operations of stencils; infinite if an inversion needs more than `_MEMORY` bytes."""
     space = pencil.space
     if settings is None:
         size, d = 2 * times.dtype.itemsize, space.dimension

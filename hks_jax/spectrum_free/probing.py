@@ -25,8 +25,8 @@ def coloured_diagonal(
 ) -> Float[Array, "m *shape"]:
     """Return the diagonal of Σₙ cₙ Tₙ(2A/top − 1) P, where P ≈ M⁻¹ and A = PK, for every row c of coefficients.
 
-    The colours (*shape) are 0, 1, …, or −1 for no colour, where the result is 0. The vector of a colour is 1 at the
-    nodes of this colour and 0 elsewhere.
+    The array of colours (*shape) has 0, 1, … at coloured nodes, and −1 at all other nodes, where the result is 0. The
+    vector of a colour is 1 at the nodes of this colour and 0 elsewhere.
     """
     stiffness, solve_mass = _products(settings, pencil)
 
@@ -43,17 +43,19 @@ def coloured_diagonal(
     return _sum_of_blocks(settings, colours, term, start)
 
 
-# For the vector v of a colour, y₀ = Pv, y₁ = Ây₀, yₙ₊₁ = 2Âyₙ − yₙ₋₁ with Â = 2PK/top − 1; the result is Σₙ cₙ v∘yₙ.
-# For P ≈ M⁻¹ and dM⁻¹ = −M⁻¹ dM M⁻¹, the tangents of aₙ = PKyₙ are P(dK yₙ + K dyₙ − dM aₙ), and dy₀ = −P dM y₀.
+# For the vector v of a colour, the Chebyshev vectors are y₀ = Pv, y₁ = Ây₀ and yₙ₊₁ = 2Âyₙ − yₙ₋₁, with the matrix
+# Â = 2PK/top − 1. The result is the sum, over n and all colours, of cₙ v∘yₙ with the coefficients cₙ and entrywise
+# products ∘. Since P ≈ M⁻¹ and dM⁻¹ = −M⁻¹ dM M⁻¹, the tangent of y₀ is −P dM y₀, and the tangents of aₙ = PKyₙ are
+# P(dK yₙ + K dyₙ − dM aₙ).
 #
-# The transpose with the cotangent g is Clenshaw's recurrence pₙ = P(v∘sₙ) + fₙ Âpₙ₊₁ − pₙ₊₂ from the last n down to 0,
-# where sₙ = Σₜ cₙ(t) g(t), f₀ = 1 and fₙ = 2. The cotangents are
+# The transpose maps a cotangent g of the result by Clenshaw's recurrence pₙ = P(v∘sₙ) + fₙ Âpₙ₊₁ − pₙ₊₂ from the last n
+# down to 0, where sₙ = Σₜ cₙ(t) g(t), f₀ = 1 and fₙ = 2 for n > 0. The cotangents of K, M and cₙ(t) are, in this order,
 #
-#     of K: Σₙ (2fₙ/top) pₙ₊₁ ⊗ yₙ,    of M: −p₀ ⊗ y₀ − Σₙ (2fₙ/top) pₙ₊₁ ⊗ aₙ,    of cₙ(t): Σ g(t)∘v∘yₙ.
+#     Σₙ (2fₙ/top) pₙ₊₁ ⊗ yₙ,    −p₀ ⊗ y₀ − Σₙ (2fₙ/top) pₙ₊₁ ⊗ aₙ    and    Σ g(t)∘v∘yₙ.
 #
-# The yₙ are needed in the order n = N − 1 … 0, and yₙ₋₁ = 2Âyₙ − yₙ₊₁ computes them in this order from the last two.
-# The three-term recurrence is as stable backwards as forwards: rounding errors grow like |Uₙ| ≤ n + 1 in both
-# directions. So the memory does not grow with the degree.
+# Clenshaw's recurrence needs the Chebyshev vectors yₙ in the order of falling n, and yₙ₋₁ = 2Âyₙ − yₙ₊₁ computes them
+# in this order, so that the memory does not grow with the degree. The three-term recurrence is as stable backwards as
+# forwards: rounding errors grow like the Chebyshev polynomials |Uₙ| ≤ n + 1 in both directions.
 @coloured_diagonal.defjvp
 def _coloured_diagonal_jvp(
     settings: Colouring, colours: StaticArray, primals: tuple, tangents: tuple
@@ -134,19 +136,17 @@ def _cotangent(
 
 
 def _scaled(top: float, image: Array, y: Array) -> Array:
-    """Return Ây = 2PKy/top − y, given y and its image PKy."""
     return (2 / top) * image - y
 
 
 def _products(settings: Colouring, pencil: NodalPencil) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
-    """Return the products with K and P ≈ M⁻¹."""
     return pencil.stiffness.of_columns(), pencil.mass_solve(settings.low, settings.mass_degree)
 
 
 def _sum_of_blocks(
     settings: Colouring, colours: StaticArray, term: Callable[[Float[Array, "*shape b"], T], T], total: T
 ) -> T:
-    """Add the terms of all blocks of colours to a total. A term is a function of the vectors of a block."""
+    """Return ``total`` plus the contributions of all blocks of colours; ``term`` adds the contribution of one block."""
     numbers, dtype = jnp.arange(settings.columns, dtype=jnp.int32), jax.tree.leaves(total)[0].dtype
 
     def step(number: Array, total: T) -> T:

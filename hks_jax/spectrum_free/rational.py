@@ -1,6 +1,6 @@
 """The diagonal of exp(−tM⁻¹K)M⁻¹ by rational approximation and selected inversion.
 
-With poles z and weights w, exp(−x) ≈ Re Σ w/(x − z). So the diagonal is about the diagonal of Re Σ w (tK − zM)⁻¹.
+With poles z and weights w, exp(−x) ≈ Re Σ w/(x − z), so that exp(−tM⁻¹K)M⁻¹ ≈ Re Σ w (tK − zM)⁻¹.
 """
 
 from functools import lru_cache
@@ -24,15 +24,15 @@ _TERMS, _SAMPLES, _SCALE = 75, 1024, 9.0
 def exponential_poles(pairs: int) -> tuple[Complex[np.ndarray, " p"], Complex[np.ndarray, " p"]]:
     """Return poles z and weights w with exp(−x) ≈ Re Σ w/(x − z) for all x ≥ 0, one pole for each conjugate pair.
 
-    The error falls by the factor 9.289² = 86 with every pair: 1.3e-2, 1e-4, 2e-6, …, 1e-13 for seven pairs. This is the
-    Carathéodory–Fejér method of Trefethen, Weideman and Schmelzer, Talbot quadratures and rational approximations
-    (2006), section 4. The half-line is mapped to the unit circle, and the function is expanded in Chebyshev
-    polynomials. The zeros of a singular vector of the coefficients' Hankel matrix are very close to the poles of the
-    best approximation.
+    The error of the approximation falls by the factor 9.289² = 86 with every pair of conjugate poles: 1.3e-2, 1e-4,
+    2e-6, …, and 1e-13 for seven pairs. The poles come from the Carathéodory–Fejér method of Trefethen, Weideman and
+    Schmelzer, Talbot quadratures and rational approximations (2006), section 4. The half-line x ≥ 0 is mapped to the
+    unit circle, and exp(−x) is expanded in Chebyshev polynomials. The zeros of a singular vector of the coefficients'
+    Hankel matrix are very close to the poles of the best approximation.
     """
     degree = 2 * pairs
     circle = np.exp(2j * np.pi * np.arange(_SAMPLES) / _SAMPLES)
-    # u in [−1, 1] represents x = −scale (u − 1)/(u + 1).
+    # The real parts u of points on the circle represent arguments x = −_SCALE (u − 1)/(u + 1) of exp(−x).
     u = circle.real
     with np.errstate(divide="ignore"):
         samples = np.where(u > -1, np.exp(_SCALE * (u - 1) / np.maximum(u + 1, 1e-16)), 0)
@@ -40,7 +40,7 @@ def exponential_poles(pairs: int) -> tuple[Complex[np.ndarray, " p"], Complex[np
     left, values, right = np.linalg.svd(hankel(coefficients[1 : _TERMS + 1]))
     value, first, last = values[degree], left[::-1, degree], right[degree]
     analytic = np.polyval(coefficients[_TERMS::-1], circle)
-    # The extended approximation is the analytic part minus ``value`` times a quotient of modulus one on the circle.
+    # The approximation on the circle is the analytic part minus a singular value times a quotient of modulus one.
     quotient = np.fft.fft(first, _SAMPLES) / np.fft.fft(last, _SAMPLES)
     extended = analytic - value * circle**_TERMS * quotient
     zeros = np.roots(last)
@@ -49,11 +49,11 @@ def exponential_poles(pairs: int) -> tuple[Complex[np.ndarray, " p"], Complex[np
     numerator = np.fft.fft(extended * np.polyval(np.poly(outside), circle)).real[degree::-1] / _SAMPLES
     apart = [np.prod(q - np.delete(outside, i)) for i, q in enumerate(outside)]
     residues = np.polyval(numerator, outside) / np.array(apart)
-    # Map the circle back to x ≤ 0, where q and 1/q have the same image.
+    # Poles q outside the circle become poles of the approximation of exp(y); q and 1/q have the same image.
     poles = _SCALE * ((outside - 1) / (outside + 1)) ** 2
     weights = 4 * residues * poles / (outside**2 - 1)
     upper = poles.imag > 0
-    # exp(y) = Re Σ 2w/(y − p); y = −x gives −2w/(x + p).
+    # For the poles p and weights w with exp(y) ≈ Re Σ 2w/(y − p), the terms at y = −x are −2w/(x + p).
     return -poles[upper], -2 * weights[upper]
 
 
@@ -66,7 +66,7 @@ def pole_pairs(dtype: Any) -> int:
 def selected_inversion(
     stiffness: PatternedOperator, mass: Operator, times: Float[Array, " m"], dissection: Dissection
 ) -> Float[Array, "m n_dof"]:
-    """Return the diagonal at each time. The dissection belongs to K's sparsity pattern, which includes M's pattern."""
+    """Return the diagonal of exp(−tM⁻¹K)M⁻¹ at each time t; the dissection is of K's pattern, which includes M's."""
     poles, weights = exponential_poles(pole_pairs(times.dtype))
     complex_type = np.result_type(times.dtype, np.complex64)
 

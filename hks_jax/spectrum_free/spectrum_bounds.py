@@ -21,13 +21,13 @@ _STEPS, _MASS_STEPS = 50, 200
 class Bounds(NamedTuple):
     """Bounds for the polynomials that approximate a pencil's heat kernel; `plan` converts them to NumPy numbers.
 
-    Let D have the row sums of M. For each axis, ``reach`` bounds the eigenvalues of D⁻¹ times the couplings of K across
-    the axis; the continuous counterpart is 2 gᵃᵃ/h². ``across`` is the least β such that the couplings C of M across
-    the axis satisfy −C ⪯ βM; β is 1 for a constant metric, and 0 if the mass is lumped.
+    The diagonal matrix D holds the row sums of M. For each axis, ``reach`` bounds the eigenvalues of D⁻¹ times the
+    couplings of K across the axis (2 gᵃᵃ/h² for a continuous metric g). ``across`` is the least β such that the
+    couplings C of M across the axis satisfy −C ⪯ βM; β is 1 for a constant metric, and 0 if the mass is lumped.
     """
 
     top: Any  # an upper bound on the eigenvalues of PK, where P ≈ M⁻¹
-    low: Any  # a lower bound on the eigenvalues of D⁻¹M, where D has the row sums of M; 1 if the mass is lumped
+    low: Any  # a lower bound on the eigenvalues of D⁻¹M for the row sums D of M; 1 if the mass is lumped
     reach: Float[Array | np.ndarray, " d"]
     across: Float[Array | np.ndarray, " d"]
     least_mass: Any  # the least entry of D
@@ -51,9 +51,9 @@ def mass_bound(pencil: Pencil) -> Float[Array, ""]:
 
 @partial(jax.jit, static_argnames="mass_degree")
 def bounds(pencil: Pencil, low: Float[Array, ""], mass_degree: int) -> Bounds:
-    """Return the bounds of a pencil on a grid, given `mass_bound`.
+    """Return the bounds of a pencil on a grid, given the bound ``low`` from `mass_bound`.
 
-    The upper bound is the smaller of Gershgorin's bound and a Lanczos estimate with a safety margin.
+    The upper bound on the spectrum is a Lanczos estimate with a margin; for a lumped mass, at most Gershgorin's bound.
     """
     nodal, d = nodal_pencil(pencil), pencil.space.dimension
     entries, sums = nodal.stiffness.coefficients, nodal.lumped_or_zero
@@ -61,9 +61,9 @@ def bounds(pencil: Pencil, low: Float[Array, ""], mass_degree: int) -> Bounds:
     offsets = np.array(list(product((-1, 0, 1), repeat=d)))
     measured = entries[None]
     if not nodal.mass.is_diagonal:
-        # M − C has the couplings within the layers of nodes that are perpendicular to the axis. This matrix consists of
-        # diagonal blocks of M, and so is positive semidefinite. Then −C = (M − C) − M ⪯ βM, where 1 + β is the greatest
-        # eigenvalue of M⁻¹(M − C).
+        # Without its couplings C across an axis, the mass M couples only nodes within layers perpendicular to the axis.
+        # The matrix M − C consists of diagonal blocks of M, and so is positive semidefinite. If 1 + β is the greatest
+        # eigenvalue of M⁻¹(M − C), the couplings C satisfy −C = (M − C) − M ⪯ βM.
         within = (offsets.T == 0).reshape(d, -1, *[1] * d)
         measured = jnp.concatenate([measured, jnp.where(within, nodal.mass.coefficients, 0)])
 

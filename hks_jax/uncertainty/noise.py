@@ -35,7 +35,7 @@ class TensorNoise(eqx.Module):
         correlation: the correlation length w of the noise in coordinate units. The noise is white noise, smoothed by a
             Gaussian with the standard deviation w, and scaled to the covariance. The noise of two nodes at a distance r
             has the correlation exp(−r²/4w²). If w is 0, the noise is independent between nodes.
-        modes: (*shape, n, m), the n fields whose random combination is the noise (see `from_modes`), or None.
+        modes: (*shape, n, m), the n fields whose sum with random factors is the noise (see `from_modes`), or None.
         freedom: the degrees of freedom of the covariance if it was estimated; infinite if it was given.
 
     Raises:
@@ -74,9 +74,9 @@ class TensorNoise(eqx.Module):
         """Return noise Σᵢ zᵢ mᵢ, where mᵢ are n given fields and zᵢ are independent standard normal numbers.
 
         For a scan, the field mᵢ is the change of the tensors that the residuals of image i cause
-        (`hks_jax.io.TensorVolume.modes`). One random factor per image makes a wild bootstrap. The noise is then
-        correlated between voxels as the residuals are. Such correlations are caused by the image reconstruction, by
-        drift of the scanner, by motion between images, and by diffusion that no tensor describes.
+        (`hks_jax.io.TensorVolume.modes`). Multiplying the residuals of each image by one random number zᵢ is called a
+        wild bootstrap. The noise Σᵢ zᵢ mᵢ is correlated between voxels like the residuals, because of the image
+        reconstruction, drift of the scanner, motion between images, and diffusion that no tensor describes.
 
         Args:
             modes: (*shape, n, m), the m components of the n fields, along the axes of the tensors and in their unit.
@@ -97,7 +97,7 @@ class TensorNoise(eqx.Module):
 
         Args:
             tensors: (*shape, d, d), the measured tensors.
-            level: the ratio, for example 0.1 for 10 %.
+            level: the ratio of the standard deviation to the mean diffusivity, for example 0.1 for 10 %.
             grid: see `TensorNoise`.
             correlation: see `TensorNoise`.
 
@@ -116,11 +116,11 @@ class TensorNoise(eqx.Module):
     def from_scans(cls, first: Any, second: Any, grid: Grid) -> "TensorNoise":
         """Estimate the noise of one scan as half of the mean squared difference of two scans of the same subject.
 
-        The function estimates one covariance, relative to the squared mean diffusivity, and one correlation length
-        from all nodes inside the mask. A median gives the size of the covariance; the correlation of neighbours along
-        the axes gives the length. The scans must be aligned, and their noise must be independent and have the same
-        covariance. The estimate includes the effect of motion between the scans. The mean of both scans has half of
-        the estimated covariance.
+        The function uses all nodes inside the mask to estimate a covariance relative to the squared mean diffusivity,
+        and a correlation length. The size of the covariance follows from the median of the squared differences over the
+        nodes, and the correlation length from the correlation of differences at neighbouring nodes. The scans must be
+        aligned, and their noise must be independent and have the same covariance. The estimate includes the effect of
+        motion between the scans. The mean of both scans has half of the estimated covariance.
 
         Args:
             first: (*shape, d, d), the tensors of the first scan.
@@ -140,7 +140,7 @@ class TensorNoise(eqx.Module):
         relative = np.einsum("na,nb->ab", parts[inside], parts[inside]) / (2 * inside.sum())
         if not np.trace(relative) > 0:
             raise ValueError("first, second: got equal tensors; expected different noise. Pass a second scan")
-        # The median of q is scaled to the median of χ², because a few nodes, such as nodes in fluid, are much noisier.
+        # The covariance is scaled so that the median of q is the median of χ²: a few nodes, as in fluid, are noisier.
         q = np.einsum("na,ab,nb->n", parts[inside], np.linalg.pinv(2 * relative), parts[inside])
         relative *= np.median(q) / (2 * scipy.special.gammaincinv(len(relative) / 2, 0.5))
         # White noise, smoothed with the width w, has the correlation exp(−h²/4w²) at the distance h.
@@ -156,10 +156,10 @@ class TensorNoise(eqx.Module):
     def from_roughness(cls, tensors: Any, grid: Grid) -> "TensorNoise":
         """Estimate the level of noise from second differences of the tensors.
 
-        In a smooth field, the tensor at a node minus the mean of its two neighbours along an axis is noise, with √1.5
-        times the standard deviation of the noise of one node. A median over all nodes and axes is robust against a few
-        edges. The noise must be independent between nodes. The estimate is too small after smoothing or interpolation,
-        and too large in fine anatomy.
+        In a smooth field, the tensor at a node minus the mean of its two neighbours along an axis is only noise, with
+        √1.5 times the standard deviation of the noise at one node. The median of these differences over all nodes and
+        axes hardly depends on the few nodes at edges of the anatomy. The noise must be independent between nodes. The
+        estimate is too small after smoothing or interpolation, and too large in fine anatomy.
 
         Args:
             tensors: (*shape, d, d), the measured tensors.

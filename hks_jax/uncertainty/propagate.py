@@ -28,19 +28,19 @@ Method = Literal["auto", "resample", "linear", "exact"]
 _SIGNS = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
 """The corners of a regular tetrahedron: the corners of the cube with an even number of minus signs."""
 _BALANCED = len(_SIGNS)
-"""The number of noisy maps in one balanced sample, one for each corner of the tetrahedron."""
+"""The number of noisy tensor fields in one balanced sample, one for each corner of the tetrahedron."""
 _LEAST = 8
-"""The least number of noisy maps for an estimate of the bias and of the second-order variance."""
+"""The least number of noisy tensor fields for estimates of the bias and of the variance's second-order part."""
 _SCALE = 0.5
-"""The factor s of the added noise, which is less than 1, because the measured tensors already contain noise."""
+"""The factor s of samples of the noise. It is less than 1, because the measured tensors already contain noise."""
 _FLOOR = 0.01
-"""The least eigenvalue of corrected indefinite tensors, relative to the mean eigenvalue without added noise."""
+"""The fraction of the measured mean eigenvalue to which smaller eigenvalues of indefinite noisy tensors are raised."""
 _LOUD = 3.0
-"""The upper limit for the median ratio of a component's standard deviation to the mean diffusivity."""
+"""The upper limit for the noise: the standard deviation relative to the mean diffusivity, in the median over nodes."""
 
 
 class _Moments(eqx.Module):
-    """The sum of squared linear parts of balanced samples, and the mean and squared deviations of their even parts."""
+    """Sums over balanced samples: squared first-order changes of the value; mean and spread of second-order changes."""
 
     n: Array
     odd: Any
@@ -50,7 +50,7 @@ class _Moments(eqx.Module):
 
     @jax.jit
     def add(self, found: Any, even: Any, indefinite: Array) -> "_Moments":
-        """Return the moments after four more maps (Welford 1962)."""
+        """Return the moments after one more balanced sample (Welford 1962)."""
         n = self.n + 1
         odd = jax.tree.map(lambda s, f: s + jnp.mean(f**2, axis=0), self.odd, found)
         mean = jax.tree.map(lambda mean, e: mean + (e - mean) / n, self.even, even)
@@ -58,15 +58,14 @@ class _Moments(eqx.Module):
         return _Moments(n, odd, mean, spread, self.indefinite + indefinite)
 
 
-# Let η₁, η₂, η₃ be independent noise with the covariance Σ. The four sums δ = (±η₁ ± η₂ ± η₃)/√3 are the corners of a
-# tetrahedron; each δ has the covariance Σ. Let y be the four maps of D + sδ, where D are the measured tensors and s is
-# `_SCALE`. The δ add up to zero, so the mean of y minus the map of D is of second order, with the expectation s² times
-# the bias. Up to second order, y₁ + y₂ − y₃ − y₄ = 4sJη₁/√3 with the Jacobian J; similar formulas give Jη₂ and Jη₃. So
-# four maps give three samples. A quadratic form of δ, averaged over the four δ, has a third of its variance for one δ.
+# Let η₁, η₂, η₃ be independent samples of noise with the covariance Σ. The four sums δ = (±η₁ ± η₂ ± η₃)/√3 with an
+# even number of minus signs form a tetrahedron and add up to zero; each δ has the covariance Σ. Let y₁, …, y₄ be the
+# function's values at D + sδ, where D are the measured tensors and s is `_SCALE`. Because the δ add up to zero, the
+# mean of the y minus the value at D is of second order in δ, and has the expectation s² times the bias. To first order
+# in δ, y₁ + y₂ − y₃ − y₄ is 4sJη₁/√3 with the Jacobian J of the function. Similar sums give Jη₂ and Jη₃, and thus three
+# samples of the error. The mean of a quadratic form over the four δ has a third of the variance of the form at one δ.
 @jax.jit
 def _parts(maps: list[Any], value: Any) -> tuple[Any, Any]:
-    """Return the samples Jη (3, …) of the noise of the value, and the even part, whose expectation is the bias."""
-
     def linear(*y: Array) -> Array:
         signs = jnp.asarray(_SIGNS.T * (math.sqrt(3) / (4 * _SCALE)), y[0].dtype)
         return jnp.tensordot(signs, jnp.stack(y), 1, precision=jax.lax.Precision.HIGHEST)
@@ -100,30 +99,32 @@ def uncertainty(
         bars = hj.uncertainty(signature, D, hj.TensorNoise.relative(D, 0.1))
         bars.deviation, bars.bias, bars.interval(0.95), bars.z(1.0), bars.summary()
 
-    Four samples δ of the noise, which add up to zero, are drawn at a time, and the maps of D + δ/2 are computed. The
-    differences of these maps give three samples of the error of the value, and their mean gives the bias. The noise is
-    halved, because the measured tensors D already contain noise. The relative error of a deviation is 29 % with 8
-    draws, and 8 % with 100 draws.
+    Samples δ of the noise are drawn in groups of four that add up to zero, and the function is evaluated at D + δ/2,
+    where D are the measured tensors. The differences of the four values of a group give three samples of the error of
+    the value at D, and the mean of the four values gives the bias. Half of δ is added, because D already contains
+    noise: the whole sample δ would exaggerate second-order effects. The relative error of a standard deviation is 29 %
+    with 8 draws, and 8 % with 100 draws.
 
     Args:
         function: maps tensors (*shape, d, d) to an array, or to a pytree of arrays. JAX must be able to trace the
             function, unless `compiled` is false. Times and energies should be fixed, and not depend on the eigenpairs.
         tensors: (*shape, d, d), the measured tensors at nodes or cells; positive definite at nodes with noise.
         noise: the noise of the tensors (see `TensorNoise`).
-        method: ``"resample"`` computes maps of noisy tensors. ``"exact"`` computes the first-order variance of each
-            number of the result by one reverse-mode product. ``"linear"`` multiplies `draws` samples of the noise by
-            the Jacobian. Both of these methods also compute eight maps for the bias and the second-order variance.
-            ``"auto"`` chooses ``"exact"`` if the result has at most `draws` numbers, or else ``"resample"``, because a
-            product with the Jacobian of a signature takes as long as one or two signatures.
-        draws: the number of noisy maps (products for ``"linear"``), at least 8; rounded up to a multiple of four.
+        method: ``"resample"`` evaluates the function at noisy tensors. ``"exact"`` computes the first-order variance of
+            each number of the result by one reverse-mode product. ``"linear"`` multiplies `draws` samples of the noise
+            by the Jacobian. ``"exact"`` and ``"linear"`` also evaluate the function at eight noisy tensor fields, for
+            the bias and the second-order variance. ``"auto"`` chooses ``"exact"`` if the result has at most `draws`
+            numbers, or else ``"resample"``, because a product with the Jacobian of a signature takes as long as
+            computing one or two signatures.
+        draws: the number of noisy tensor fields (products for ``"linear"``), at least 8; rounded up to multiples of 4.
         smoothing: the standard deviation, in coordinate units, of a Gaussian that smooths the tensors before the
             function is evaluated (see `smooth_tensors`); the noise must have a grid. 0 for no smoothing.
         seed: the seed of the random numbers.
-        compiled: whether to compile the function once for all draws. Otherwise the function is called directly.
-        progress: a function that is called with a short text after every four maps.
-        checkpoint: a file that is written after every four maps. If the file exists, resampling continues.
-        each: a function that is called with each sample of the noise of the value, three times for four maps, for
-            example to compute covariances or errors of means. Samples in a checkpoint are not passed to it again.
+        compiled: whether to compile the function once for all draws; if false, the function is called as it is.
+        progress: a function that is called with a short text after every four noisy tensor fields.
+        checkpoint: a file that is written after every four noisy tensor fields. If it exists, resampling continues.
+        each: a function that is called with each sample of the value's error (three for every four noisy tensor
+            fields), for example to compute covariances. It is not called again for samples in a checkpoint.
 
     Returns:
         The value with its standard deviation, its bias and their accuracy. Under `jit`, `method` must not be
@@ -134,7 +135,7 @@ def uncertainty(
             belongs to another computation.
 
     Warns:
-        AccuracyWarning: if no intervals are claimed, because noise makes tensors indefinite or acts nonlinearly.
+        AccuracyWarning: if intervals are not reliable, because noise makes tensors indefinite or acts nonlinearly.
 
     Examples:
         >>> noise = hj.TensorNoise.relative(field.tensors, 0.1)
@@ -195,7 +196,6 @@ def uncertainty(
 
 
 def _check(measured: Array, noise: TensorNoise, method: str, draws: int, smoothing: float) -> None:
-    """Raise ValueError if the tensors and the noise differ in shape or unit, or if a setting is invalid."""
     if not isinstance(noise, TensorNoise):
         raise TypeError(f"noise: got {type(noise).__name__}; expected hks_jax.TensorNoise")
     if method not in get_args(Method):
@@ -226,10 +226,7 @@ def _check(measured: Array, noise: TensorNoise, method: str, draws: int, smoothi
 
 
 def _positive(measured: Array, noisy: Array) -> tuple[Array, Array]:
-    """Raise small eigenvalues of indefinite noisy tensors; return all tensors, and the share that was indefinite.
-
-    Nodes whose tensor is not positive definite without noise, as outside a mask, are ignored.
-    """
+    """Increase small eigenvalues of indefinite noisy tensors; return all tensors, and the share that was indefinite."""
     valid = spd.is_positive(measured)
     bad = valid & ~spd.is_positive(noisy)
 
@@ -244,17 +241,13 @@ def _positive(measured: Array, noisy: Array) -> tuple[Array, Array]:
 
 
 def _white(noise: TensorNoise, seed: Any, index: Any, dtype: Any) -> Array:
-    """Return the standard normal numbers of one draw, which are the argument of `TensorNoise.tensors`."""
     key = jax.random.fold_in(jax.random.key(seed), index)
     return jax.random.normal(key, noise.white_shape, dtype)
 
 
 @jax.jit
 def _four(measured: Array, noise: TensorNoise, seed: Any, index: Any) -> tuple[list[Array], Array]:
-    """Return four noisy fields, and the sum of their shares of tensors that the full noise would make indefinite.
-
-    The four samples of the noise add up to zero, and each field contains half of one sample.
-    """
+    """Return four noisy fields, and the sum of the shares of tensors that the full noise makes indefinite in each."""
     each = jnp.stack([noise.tensors(_white(noise, seed, 3 * index + i, measured.dtype)) for i in range(3)])
     changes = jnp.tensordot(
         jnp.asarray(_SIGNS / math.sqrt(3), each.dtype), each, 1, precision=jax.lax.Precision.HIGHEST
@@ -274,7 +267,6 @@ def _sampled(
     checkpoint: str | os.PathLike[str] | None,
     each: Callable[[Any], None] | None,
 ) -> _Moments:
-    """Return the moments over all balanced samples of four maps."""
     nothing = jax.tree.map(jnp.zeros_like, value)
     none = jnp.zeros((), measured.dtype)
     moments = _Moments(none, nothing, nothing, nothing, none)

@@ -12,9 +12,9 @@ from jaxtyping import Array, Float
 from hks_jax.checks import require_number
 
 BEYOND = 0.02
-"""The largest median ratio of the second-order to the first-order variance for which intervals are claimed."""
+"""Confidence intervals are reliable if the median of `beyond_linear` over a map is at most this number."""
 INDEFINITE = 0.02
-"""The largest share of tensors made indefinite by noise for which intervals are claimed."""
+"""Confidence intervals are reliable if noise makes at most this share of the tensors indefinite."""
 
 
 class Uncertainty(eqx.Module):
@@ -28,15 +28,15 @@ class Uncertainty(eqx.Module):
         deviation: the standard deviation of the value due to noise.
         bias: the mean of the function over the noise, minus the value without noise.
         bias_error: the standard deviation of ``bias``, which is estimated from few draws.
-        beyond_linear: the ratio of the second-order variance to the first-order variance in the noise.
-        smear: the change of the map by smoothing the smoothed tensors again, an estimate of the change that smoothing
-            causes; None without smoothing.
-        indefinite: the share of tensors that noise of full size makes indefinite.
+        beyond_linear: the part of the variance of second order in the noise, divided by the part of first order.
+        smear: the change of the value if the smoothed tensors are smoothed once more, an estimate of the change that
+            smoothing causes; None without smoothing.
+        indefinite: the share of the measured tensors that a sample of the noise, added as a whole, makes indefinite.
         sampling_error: the relative standard deviation of ``deviation``; 0 if ``deviation`` is exact to first order.
         method: ``"resample"``, ``"linear"`` or ``"exact"``.
-        draws: the number of maps of noisy tensors that were computed.
+        draws: the number of noisy tensor fields at which the function was evaluated.
         freedom: the degrees of freedom of ``deviation``, limited by `TensorNoise.freedom`; infinite if it is exact.
-        samples: the degrees of freedom of ``beyond_linear``.
+        samples: the number of degrees of freedom of the estimate ``beyond_linear``.
     """
 
     value: Any
@@ -54,7 +54,7 @@ class Uncertainty(eqx.Module):
 
     def __repr__(self) -> str:
         shapes = jax.tree.map(jnp.shape, self.value)
-        return f"Uncertainty({shapes}, {self.method}, {self.draws} draws, deviation to {self.sampling_error:.0%})"
+        return f"Uncertainty({shapes}, {self.method}, {self.draws} draws, deviation ± {self.sampling_error:.0%})"
 
     @property
     def corrected(self) -> Any:
@@ -73,14 +73,14 @@ class Uncertainty(eqx.Module):
         return jax.tree.map(jnp.subtract, self.corrected, half), jax.tree.map(jnp.add, self.corrected, half)
 
     def z(self, reference: Any = 0.0) -> Any:
-        """Return (value − reference)/deviation. For 4πt·HKS, the reference 1 compares the value with flat space."""
+        """Return (value − reference)/deviation. For 4πt·HKS, the reference 1 is the value in flat space."""
         return jax.tree.map(lambda v, s: (v - reference) / s, self.value, self.deviation)
 
     @property
     def trusted(self) -> Any:
-        """Whether intervals are claimed: one bool for each number, or for each entry of the first axis of maps.
+        """Whether the intervals are reliable: one bool for each number, or for each entry of the first axis of maps.
 
-        Intervals are claimed if `beyond_linear` is at most 2 % in the median over the map, the bias is at most the
+        Intervals are reliable if `beyond_linear` is at most 2 % in the median over the map, the bias is at most the
         standard deviation in the median, and noise makes at most 2 % of the tensors indefinite.
         """
 
@@ -88,7 +88,7 @@ class Uncertainty(eqx.Module):
             maps = (len(deviation) if deviation.ndim > 1 else deviation.size, -1)
             share = jnp.abs(bias / jnp.where(deviation > 0, deviation, jnp.nan)).reshape(maps)
             second = jnp.where(deviation > 0, beyond, jnp.nan).reshape(maps)
-            # The median of an estimate from few draws is below its mean, so the limit is multiplied by their ratio.
+            # The median of an estimate from few draws is below its mean; the limit is multiplied by median/mean.
             limit = BEYOND * float(scipy.special.fdtri(self.samples, min(self.freedom, 1e6), 0.5))
             small = (jnp.nanmedian(second, axis=1) <= limit) & (jnp.nanmedian(share, axis=1) <= 1)
             return (small & (self.indefinite <= INDEFINITE)).reshape(deviation.shape[:1])
@@ -97,9 +97,9 @@ class Uncertainty(eqx.Module):
 
     @property
     def signal_to_noise(self) -> Any:
-        """The signal-to-noise ratio √((V − N)/N) of each entry of the first axis, for example of each time.
+        """The signal-to-noise ratio √((V − N)/N) for each entry of the value's first axis, for example for each time.
 
-        V is the variance of the measured map over the nodes, and N is the mean variance of the noise, which V includes.
+        V is the variance of the noisy value over the nodes, and N is the mean variance of the noise over the nodes.
         """
         return self.signal_to_noise_at(True)
 
@@ -107,7 +107,7 @@ class Uncertainty(eqx.Module):
         """Return `signal_to_noise` over the given nodes, for example nodes with little influence of the boundary.
 
         Args:
-            nodes: bool array that broadcasts to the shape of the value. The ratio is NaN if no node is true.
+            nodes: bool array that broadcasts to the shape of the value; if it is False everywhere, the ratio is NaN.
         """
 
         def of(value: Array, deviation: Array) -> Array:
@@ -122,14 +122,14 @@ class Uncertainty(eqx.Module):
         """Return warnings about the accuracy of these numbers, as sentences."""
         if (share := float(self.indefinite)) > INDEFINITE:
             return [
-                f"no intervals are claimed, because noise makes {share:.2%} of the tensors indefinite. Smooth the "
+                f"intervals are not reliable, because noise makes {share:.2%} of the tensors indefinite. Smooth the "
                 "tensors (smoothing=), or leave the noisiest nodes out of the mask"
             ]
         claimed = np.concatenate([np.asarray(each).ravel() for each in jax.tree.leaves(self.trusted)])
         if claimed.all():
             return []
         return [
-            f"no intervals are claimed for {int((~claimed).sum())} of {claimed.size} numbers or maps: the effect of "
+            f"intervals are not reliable for {int((~claimed).sum())} of {claimed.size} numbers or maps: the effect of "
             "noise is not linear, or the bias exceeds the deviation (see `trusted`). Smooth the tensors (smoothing=)"
         ]
 

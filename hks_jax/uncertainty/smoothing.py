@@ -18,7 +18,7 @@ def smooth_tensors(grid: Grid, tensors: Any, width: float) -> Float[Array, "*sha
 
     The logarithms of the tensors are averaged, so the logarithm of the determinant is averaged with the same weights
     (Arsigny, Fillard, Pennec and Ayache 2006). At the boundary, the mean includes only nodes inside the mask. The
-    result is differentiable, and equals the identity outside the mask.
+    result is differentiable, and is the identity matrix outside the mask.
 
     Args:
         grid: the grid of the tensors; nodes outside its mask do not contribute.

@@ -111,6 +111,15 @@ def test_npz_end_to_end_equals_the_library(npz, tmp_path, capsys):
         assert read["eigenvalues"].shape == (25,)
 
 
+def test_times_that_do_not_suit_the_domain_are_reported(npz, tmp_path):
+    out = tmp_path / "out"
+    assert main(["hks", str(npz), "-o", str(out), "-q", "-k", "25", "--times", "0.01", "2", "500"]) == 0
+    warnings = json.loads((out / "report.json").read_text())["warnings"]
+    assert any("1 of 3 times are too large" in each for each in warnings)
+    assert any("1 of 3 times are too small" in each for each in warnings)
+    assert ["too few eigenpairs" in title for title in signature.titles_of(Result.read(out))] == [True, False, False]
+
+
 def test_report_says_what_was_done(npz, tmp_path, capsys):
     out = tmp_path / "out"
     # A time that 25 pairs do not resolve: the report carries the warning and a large truncation.

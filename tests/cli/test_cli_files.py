@@ -65,7 +65,7 @@ def test_a_scan_to_pictures_by_one_command(scan, tmp_path, capsys):
     out, mask = tmp_path / "out", str(tmp_path / "m.nii.gz")
     arguments = ["--mask", mask, "--slice", "z=3", "--metric", "inverse", "-k", "20", "--times", "2e4", "4e4"]
     assert main(["info", *scan, *arguments[:4]]) == 0
-    assert "warning: 1 tensors inside have an eigenvalue near zero" in capsys.readouterr().err
+    assert "warning: 1 tensors in the mask have an eigenvalue near zero" in capsys.readouterr().err
     arguments += ["--repair", "nearest:1e-6"]
     assert main(["hks", *scan, "-o", str(out), "-q", *arguments]) == 0
     assert capsys.readouterr().err == ""

@@ -30,6 +30,7 @@ from hks_jax.io import TensorVolume, read_tensors, save_tensors
 from hks_jax.io.masks import names_beside, read_names
 from hks_jax.io.nifti import component_of
 from hks_jax.io.pairs import pairs_of
+from hks_jax.io.result import Result
 from hks_jax.io.tables import read_table, write_table
 from hks_jax.storage import claim
 
@@ -291,6 +292,7 @@ def test_a_study_is_a_bids_derivative(study, monkeypatch):
 
     # One result's table by itself is that of the study; on other voxels, labels are refused.
     atlas = study / "atlas_dseg.nii.gz"
+    np.testing.assert_array_equal(Result.read(out / "sub-01").values, Result.read(f"{stem}.npz").values)
     assert main(["stats", f"{stem}.npz", "--atlas", str(atlas), "-o", str(study / "r.tsv"), "-q"]) == 0
     assert (study / "r.tsv").read_text() == stem.with_name("sub-01_model-tensor_param-hks_regions.tsv").read_text()
     (row,) = (row for row in table(study / "r.tsv") if row["index"] == "17")
@@ -383,6 +385,7 @@ def test_a_subject_is_done_again_when_its_sidecar_changes(study):
         ("participant_id\tfile\nsub-1\ta\n1\tb\n", "two rows for sub-1"),
         ("participant_id\tfile\nsub-a_b\ta\n", "only letters and digits"),
         ("participant_id,file\n", "separated by tabs"),
+        ("participant_id file\nsub-1 a\n", "expected columns separated by tabs"),
     ],
 )
 def test_a_table_that_is_wrong_for_all_is_refused(tmp_path, capsys, text, words):

@@ -70,6 +70,17 @@ def test_three_metrics_of_a_diffusion_tensor(rng):
     np.testing.assert_allclose(np.linalg.det(adjugate), np.linalg.det(D) ** 2, rtol=1e-11)
     with pytest.raises(ValueError, match=r'metric: got None; expected "inverse".*"tensor".*"adjugate".*no default'):
         hj.TensorField.from_diffusion(grid, D)
+    volume = hj.io.TensorVolume(D, (1.0,) * 3, (0.0,) * 3)
+    with (
+        unchecked(),
+        pytest.raises(TypeError, match=r"grid: got TensorVolume; expected hks_jax.Grid. Pass volume.grid\(\)"),
+    ):
+        hj.TensorField.from_diffusion(volume, "inverse")
+    with (
+        unchecked(),
+        pytest.raises(ValueError, match=r"mask: got 'mask.nii'; expected a bool array.*`read_mask` reads a file"),
+    ):
+        volume.with_mask("mask.nii")
 
 
 def test_values_outside_the_mask_do_not_matter(rng):

@@ -115,7 +115,7 @@ def test_b_values_in_another_unit_are_refused_until_it_is_told(scan, capsys, uni
     images, b, g = map(str, scan.write())
     arguments = ["info", images, "--bval", b, "--bvec", g]
     assert main(arguments) == 2
-    assert f"pass --unit {unit}, the unit of the tensors" in capsys.readouterr().err
+    assert f"in 1/({unit}), the largest is 1000 s/mm²: pass --unit {unit}\n" in capsys.readouterr().err
     assert main([*arguments, "--unit", unit]) == 0
     assert "(b ≤ 1000 s/mm²)" in capsys.readouterr().out
 

@@ -8,6 +8,7 @@ import pytest
 
 import hks_jax as hj
 from hks_jax.io import TensorVolume, read_mask, read_tensors, save, save_tensors
+from hks_jax.io.masks import read_labels
 from hks_jax.io.nrrd import KINDS
 
 nrrd = pytest.importorskip("nrrd")
@@ -255,11 +256,15 @@ def test_results_without_an_affine(tmp_path):
         save(tmp_path / "v.nhdr", np.ones((3, 4)), plane)
 
 
-def test_masks(tmp_path, volume):
+def test_masks_and_labels(tmp_path, volume):
     header = {"space": "left-posterior-superior", "space directions": (LPS @ AXES * SPACING).T}
     header["space origin"] = LPS @ ORIGIN
     nrrd.write(str(tmp_path / "m.nrrd"), volume.mask.astype(np.uint8), header, index_order="F")
     np.testing.assert_array_equal(read_mask(tmp_path / "m.nrrd", volume.affine), volume.mask)
+    labels = np.arange(volume.mask.size).reshape(SHAPE)
+    nrrd.write(str(tmp_path / "labels.nrrd"), labels, header, index_order="F")
+    np.testing.assert_array_equal(read_labels(tmp_path / "labels.nrrd", volume), labels)
+    np.testing.assert_array_equal(read_labels(tmp_path / "labels.nrrd", volume.slice("y", 2)), labels[:, 2])
     header["space origin"] = ORIGIN
     nrrd.write(str(tmp_path / "m.nrrd"), volume.mask.astype(np.uint8), header, index_order="F")
     with pytest.raises(ValueError, match="the mask's affine displaces it"):

@@ -87,7 +87,7 @@ def test_the_report(volume):
         "first": [[2, 3], [4, 1]],
     }
     assert "2 of 63 tensors have an eigenvalue below 0.0001 (the worst eigenvalue is -0.0004)" in mended.notes[-1]
-    assert "eigenvalues are raised to 0.0001" in mended.notes[-1]
+    assert "raises eigenvalues of invalid tensors to 0.0001" in mended.notes[-1]
     sound = repair_tensors(mended, "mask")
     assert (sound.repair["voxels"], sound.notes) == (0, mended.notes)
     np.testing.assert_array_equal(sound.inside, volume.inside)

@@ -187,9 +187,9 @@ def test_info_says_units_and_asks(tmp_path, capsys):
     text = capsys.readouterr().out
     assert "spacing         0.15 × 0.15 × 0.15 mm\n" in text
     assert "voxel sizes 150 × 150 × 150 converted from um, which the file declares, to mm\n" in text
-    assert f"median {np.linalg.eigvalsh(D)[1]:.3g} mm²/s (not declared)\n" in text
-    assert "diffusivity     0.0007 mm²/s (not declared), the median" in text
-    assert " s from the size\n" in text.partition("metric inverse")[2]
+    assert f"median {np.linalg.eigvalsh(D)[1]:.3g} mm²/s (assumed)\n" in text
+    assert "diffusivity     0.0007 mm²/s (assumed), the median" in text
+    assert " s by the domain's size\n" in text.partition("metric inverse")[2]
 
     path = str(write(tmp_path / "t.nii.gz", "mm", 2.0, 1e6))
     assert main(["info", path]) == 0

@@ -200,10 +200,9 @@ def test_without_a_place_in_space_nothing_is_turned(tmp_path):
     flat = TensorVolume(np.broadcast_to(np.eye(2), (6, 5, 2, 2)), (0.5, 1.0), (1.0, 2.0))
     path = save(tmp_path / "hks.npz", values, flat, name="hks", extra={"times": [1.0]})
     for view in ("neurological", "radiological"):
-        assert main(["plot", str(path), "-o", str(tmp_path / f"{view}.png"), "--view", view, "-q"]) == 0
-    save_figure(
-        hks_panels(values, [1.0], hj.Grid((6, 5), (0.5, 1.0), (1.0, 2.0)), cmap="viridis"), tmp_path / "own.png"
-    )
+        assert main(["plot", str(path), "-o", str(tmp_path / f"{view}.png"), "--view", view, "--title", "T", "-q"]) == 0
+    grid = hj.Grid((6, 5), (0.5, 1.0), (1.0, 2.0))
+    save_figure(hks_panels(values, [1.0], grid, cmap="viridis", suptitle="T"), tmp_path / "own.png")
     own = pixels(tmp_path / "own.png")
     for view in ("neurological", "radiological"):
         np.testing.assert_array_equal(pixels(tmp_path / f"{view}.png"), own)

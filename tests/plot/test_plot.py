@@ -340,7 +340,9 @@ def test_hks_curves_are_the_values_at_the_nodes():
     np.testing.assert_allclose(ax.lines[2].get_ydata(), 2 * values[:, 1, 1])
     assert [t.get_text() for t in ax.get_legend().get_texts()] == ["(0.5, 0.5)", "(2, 1.5)", "expansion"]
     assert ax.get_xscale() == ax.get_yscale() == "log"
-    scaled = hks_curves(new_figure(3, 3).subplots(), values, times, grid, [[0, 0]], scaled=True, labels=["a"])
+    few = new_figure(3, 3).subplots()
+    scaled = hks_curves(few, values, times, grid, [[0, 0]], scaled=True, labels=["a"])
+    assert len([label for label in few.get_xticklabels("both") if label.get_text()]) <= 3  # more labels would overlap
     np.testing.assert_allclose(scaled[0].get_ydata(), 4 * np.pi * times * values[:, 0, 0])
 
 

@@ -82,7 +82,7 @@ def test_eigenpairs_on_eight_devices(found):
 def test_refusals_say_what_was_expected(found):
     for message, expected in zip(
         found["refusals"],
-        ["one axis", "one axis", "expected one length", "Slabs.split returns it", "the grid's (9, 4)"],
+        ["one axis", "one axis", "expected arrays of the same length", "Slabs.split returns it", "the grid's (9, 4)"],
         strict=True,
     ):
         assert expected in message

@@ -82,7 +82,7 @@ def test_flow_errors_and_warnings(field):
     with pytest.raises(ValueError, match="functions: got 11 NaN or infinite values inside the mask"):
         hj.heat_flow(pairs, TIMES, np.full(SHAPE, np.nan))
     rough = np.indices(SHAPE).sum(axis=0) % 2.0
-    with pytest.warns(hj.AccuracyWarning, match=r"heat flow at t = 0.02, up to [1-9]"):
+    with pytest.warns(hj.AccuracyWarning, match=r"times: at t = 0.02 up to [1-9]"):
         hj.heat_flow(pairs, TIMES, rough)
     hj.heat_flow(pairs, TIMES, pairs.eigenfunctions[1])  # nothing of it is missing
 

@@ -291,7 +291,7 @@ def test_a_bias_that_lasts_is_reported_with_its_remedy():
     pairs = hj.eigenpairs(hj.TensorField(grid, turning(grid.nodes, 20.0, 1.0)), 121)
     (message,) = hj.truncation(pairs, [3.0, 10.0]).messages()
     assert "2 of 2 times" in message
-    assert 'does not decrease with t. Use a finer grid; interpolation="log-euclidean"' in message
+    assert 'larger times do not reduce. Use a finer grid; interpolation="log-euclidean"' in message
     assert "Use times of" not in message
 
 

@@ -301,8 +301,8 @@ def test_auto_takes_each_time_from_the_method_that_reaches_it(monkeypatch):
     np.testing.assert_allclose(found.values, expected, rtol=1e-3)
     assert float(found.overlap_time) == 0.5
     assert float(found.overlap_difference) < 1e-4
-    assert "1 of 3 times by selected-inversion: 0.02" in found.summary()
-    assert "at t = 0.5 the two methods differ" in found.summary()
+    assert "1 of 3 times use selected-inversion: 0.02" in found.summary()
+    assert "at t = 0.5 the signatures with and without eigenpairs differ" in found.summary()
     np.testing.assert_array_equal(hj.hks(pairs, times, method="auto"), found.values)
     np.testing.assert_allclose(
         hj.hks(pairs, times[:1], "flat", method="spectrum-free")[0], expected[0] * 4 * np.pi * times[0], rtol=1e-3

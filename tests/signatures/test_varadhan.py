@@ -41,7 +41,7 @@ def test_flat_distances_and_why_they_are_normalised(torus):
 def test_what_is_not_resolved_is_nan_and_said(torus):
     pairs, exact = torus
     times = np.geomspace(0.02, 2.0, 9)
-    message = r"times: .*% of the distances are NaN, .*% at t = 0.02, because the heat kernel is not resolved at"
+    message = r"times: .*% of the distances are NaN \(.*% at t = 0.02\), because the heat kernel is not resolved"
     with pytest.warns(hj.AccuracyWarning, match=message) as seen:
         got = np.asarray(hj.varadhan_distance(pairs, times, MIDDLE))[:, 0]
     assert {warning.filename for warning in seen} == {__file__}

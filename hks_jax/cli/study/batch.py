@@ -14,15 +14,15 @@ Compute the signatures of many subjects at the same times, and tables of their r
 Other columns, such as age and group, are copied to participants.tsv. The values in a row replace the values of the
 command's options.
 
-DIR becomes a BIDS derivative. It contains for each subject an image with its sidecar, an .npz for hks-jax explore, plot
-and stats, a picture, and with --atlas a table of regions. The tables group_summary.tsv and group_regions.tsv contain
-all subjects.
+DIR becomes a BIDS derivative. For each subject, DIR contains an image with its sidecar, an .npz for hks-jax explore,
+plot and stats, a picture, and with --atlas a table of regions. The tables group_summary.tsv and group_regions.tsv
+contain all subjects.
 
 If the mean diffusivity of a subject, in mm2/s, is outside the range of living tissue, the subject fails until --unit or
 a column named unit gives the unit, because subjects with different units cannot be compared.
 
 If a subject fails, the others are still computed. If the command is repeated, it computes only the signatures and
-tables that are missing, or whose input files have changed. Omitted options are then those of the study in DIR.
+tables that are missing, or whose input files have changed. A repeated command takes omitted options from the study.
 
 examples:
   hks-jax batch subjects.tsv -o study --metric inverse --normalisation flat --atlas atlas.nii.gz
@@ -217,7 +217,7 @@ def _suitable(
 
 
 Range = tuple[float, float]
-"""For a subject, the least time, which voxels and eigenpairs limit, and the largest time, which the size limits."""
+"""A subject's least time (by voxel size and number of eigenpairs) and largest time (by the domain's size)."""
 
 
 def suitable_range(volume: TensorVolume, args: argparse.Namespace) -> Range:

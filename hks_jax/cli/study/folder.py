@@ -28,7 +28,7 @@ from hks_jax.storage import atomic_folder, atomic_path, existing
 MAP = "_model-tensor_param-hks_dwimap"
 REGIONS = "_model-tensor_param-hks_regions"
 PAIRS = "_model-tensor_param-hks_pairs.npz"
-"""The endings of a subject's files: the signature, the table of its regions, and the saved eigenpairs."""
+"""The suffixes of file names: a subject's signature, the table of its regions, and its saved eigenpairs."""
 _SUFFIXES = {MAP: ".npz", REGIONS: ".tsv"}
 GENERATED_BY = {"Name": "hks-jax", "Version": __version__}
 _TEMPORARY = re.compile(r"\.[0-9a-f]{12}\..+")
@@ -124,7 +124,7 @@ class Study:
     def forget(self, subject: Subject) -> None:
         """Remove files of a subject from an interrupted run or from a run with other settings."""
         sidecar, picture = self.path(subject, f"{MAP}.json"), self.path(subject, f"{MAP}.png", "figures")
-        sidecar.unlink(missing_ok=True)  # first, because its existence means that the other files are complete
+        sidecar.unlink(missing_ok=True)  # first, because a sidecar means that the other files are complete
         ours = [file for kind in _SUFFIXES for file in sidecar.parent.glob(f"{subject.name}{kind}.*")]
         for path in [*ours, picture, sidecar.with_name("explore.html")]:
             path.unlink(missing_ok=True)
@@ -187,7 +187,7 @@ class Study:
 
 
 def reading_options(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the options for reading and noise, with "file" in place of the path of a second scan, which may change."""
+    """Return the options for reading and noise; "file" replaces the path of a second scan, because files may move."""
     names = [option for option in COLUMNS if args.noise is not None or option not in ("noise", "draws")]
     reading = {option: getattr(args, option.replace("-", "_")) for option in names}
     return reading if second_scan(args) is None else {**reading, "noise": "file"}

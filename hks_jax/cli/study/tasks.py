@@ -59,7 +59,7 @@ def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debu
         except Exception as error:
             failed(subject, error)
     pending = [task for task in plan if task.missing]
-    # A subject that ended an earlier process, perhaps by lack of memory, may end this process too, so it comes last.
+    # A subject whose computation killed an earlier process, perhaps by lack of memory, may kill this one: it is last.
     pending.sort(key=lambda task: task.attempt.exists())
     if len(pending) < len(plan):
         progress.end(f"{len(plan) - len(pending)} of {len(subjects)} subjects are already done")

@@ -1,11 +1,11 @@
 """The interface of linear solvers for derivatives of eigenpairs, and their common functions, in NumPy or JAX.
 
-Derivatives of a truncated spectrum need linear solves with K − λᵢM on the M-orthogonal complement of the p lowest
-eigenvectors. On this complement, K − σM is positive definite for *every* σ below the next eigenvalue Λ, even if it is
-indefinite on the whole space. If K − λᵢM is preconditioned with K − σM, its spectrum lies between 1 and (Λ − λᵢ)/(Λ −
-σ). So right-hand sides (rows) are grouped by λᵢ, and each group has its own shift σ. A few factorisations then suffice
-for fast convergence of all rows. `HostAdjoint` uses SciPy's factorisations, `FactorisedAdjoint` uses factorisations in
-JAX, and `FilteredAdjoint` uses a polynomial.
+Derivatives of eigenpairs need linear solves with K − λᵢM on the M-orthogonal complement of the p lowest eigenvectors.
+For every shift σ below the lowest eigenvalue Λ on the complement of the p eigenvectors, K − σM is positive definite on
+the complement, even if it is indefinite on the whole space. Preconditioning with K − σM maps the spectrum of K − λᵢM on
+the complement to the interval between 1 and (Λ − λᵢ)/(Λ − σ). Each group of right-hand sides with similar λᵢ has its
+own shift σ, so that a few factorisations of K − σM suffice for fast convergence. `HostAdjoint` uses SciPy's
+factorisations, `FactorisedAdjoint` uses factorisations in JAX, and `FilteredAdjoint` uses a polynomial.
 """
 
 from abc import abstractmethod
@@ -24,12 +24,12 @@ from hks_jax.linear.pencil import P, SymmetricPencil
 from hks_jax.linear.products import even_size, inner_products, matmul, products_with_columns, row_blocks
 
 Array = Any
-"""An array of NumPy or JAX; all arguments and the result are of the same library."""
+"""An array of NumPy or JAX. All arguments of a function and its result are arrays of the same library."""
 Scalar = Float[Array, ""]
 Values = Float[Array, " p"]
 """The p lowest eigenvalues, in ascending order."""
 Vectors = Float[Array, "p n_dof"]
-"""The M-orthonormal eigenvectors Φ of these eigenvalues."""
+"""The M-orthonormal eigenvectors Φ of the p lowest eigenvalues, as rows."""
 Rows = Float[Array, "k n_dof"]
 """Right-hand sides or solutions as rows; row i belongs to λᵢ."""
 OfRows = Float[Array, " k"]
@@ -39,12 +39,12 @@ Shifts = Float[Array, " groups"]
 SINGULAR = 1e-8
 """The Rayleigh quotient below which K − λᵢM counts as singular, relative to the first eigenvalue on the complement."""
 _LEAST = 100
-"""In units of ε: the least relative tolerance, and the relative norm below which a projected row counts as zero."""
+"""In units of ε: the least relative tolerance, and the relative norm at which a projected right-hand side is zero."""
 _FACTORISATION = 200
-"""The cost of a factorisation in solves of one row. About 100 is doubled, because small rows take few steps."""
+"""Twice the cost of a factorisation of K − σM, in units of one conjugate gradient step for one right-hand side."""
 _MOST_GROUPS = 16
 _ROWS = 128
-"""The number of rows projected together; with fewer rows, the eigenvectors are read from memory more often."""
+"""The number of right-hand sides projected at once; with fewer, the eigenvectors are read from memory more often."""
 
 
 class Adjoint(eqx.Module, Generic[P]):
@@ -53,8 +53,8 @@ class Adjoint(eqx.Module, Generic[P]):
     The field ``adjoint`` of each eigensolver has a default; any `Adjoint` that supports the pencil may replace it.
 
     Attributes:
-        tolerance: the wanted error in the energy norm, relative to the largest row. Because of the rounding errors of
-            eigenvectors, the error has a lower bound.
+        tolerance: the wanted error in the energy norm, relative to the largest right-hand side. Rounding errors of the
+            eigenvectors limit the attainable error.
     """
 
     tolerance: eqx.AbstractVar[float]
@@ -70,7 +70,7 @@ class Adjoint(eqx.Module, Generic[P]):
     def solve(self, prepared: Any, pencil: P, values: Values, vectors: Vectors, rhs: Rows) -> Rows:
         """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0, where Q = I − MΦΦᵀ, p ≥ k and p < n_dof.
 
-        ``prepared`` is the result of `prepare`. Rows that did not converge are NaN. The method works under `jit`.
+        ``prepared`` is the result of `prepare`. Solutions that did not converge are NaN. The method works under `jit`.
         """
 
 
@@ -82,7 +82,8 @@ def attainable(tolerance: float, dtype: Any) -> float:
 def definite_product(
     stiffness: Callable[[Array], Array], mass: Callable[[Array], Array], shifts: Float[Array, " b"], beyond: Scalar
 ) -> Callable[[Columns], tuple[Columns, Float[Array, " b"]]]:
-    """Return a function that maps xᵢ to (K − λᵢM) xᵢ and to the energy below which K − λᵢM counts as singular."""
+    """Return the function that maps columns xᵢ to (K − λᵢM) xᵢ, and to the energies xᵢᵀ(K − λᵢM)xᵢ below which the
+    matrices K − λᵢM count as singular."""
 
     def product(x: Columns) -> tuple[Columns, Float[Array, " b"]]:
         image = mass(x)
@@ -92,7 +93,7 @@ def definite_product(
 
 
 def first_beyond(values: Values) -> Scalar:
-    """Estimate Λ, the first eigenvalue on the complement, given computed eigenvalues; the last must be positive."""
+    """Estimate the lowest eigenvalue Λ beyond the computed eigenvalues, of which the largest must be positive."""
     return values[-1] * (1 + 1 / values.size)
 
 
@@ -104,24 +105,24 @@ def amplification(values: Values, k: int) -> OfRows:
 
 # The tolerance is relative to the right-hand sides bᵢ before the projection Q = I − MΦΦᵀ. The projections Qbᵢ may be
 # pure rounding errors. For example, if the tensors T change by a multiple of T, dK and dM are multiples of K and M, so
-# that bᵢ is a multiple of Mφᵢ and Qbᵢ = 0. Such noise lies mostly in the span of MΦ, so that a solution with a small
-# error relative to the noise does not exist. Therefore such a row counts as zero. The same holds in reverse mode, where
-# the bᵢ are cotangents of the solutions. For example, if all nodes have equal weights, the bᵢ are multiples of Mφᵢ.
+# that bᵢ is a multiple of Mφᵢ and Qbᵢ = 0. Rounding errors in Qbᵢ lie mostly in the span of MΦ, so that no solution is
+# accurate relative to these errors. Therefore a projection Qbᵢ at the level of rounding counts as zero. Also in reverse
+# mode, where bᵢ is a cotangent of φᵢ, the projection Qbᵢ may be pure rounding errors. For example, if the loss is the
+# integral of a signature over the domain, bᵢ is a multiple of Mφᵢ.
 #
-# Small rows need fewer correct digits, or none, because they contribute little to sums over all rows. Rows with λᵢ near
-# Λ have a larger weight, because the inverse amplifies them.
+# Right-hand sides need fewer correct digits if they are small, because they contribute little to sums over all i, and
+# more if λᵢ is near the lowest eigenvalue Λ on the complement, because (K − λᵢM)⁻¹ amplifies them.
 def wanted_errors(before: OfRows, after: OfRows, amplified: OfRows, tolerance: float, dtype: Any) -> OfRows:
-    """Return the wanted errors in the energy norm, relative to each row's own norm; infinite for rows that are zero.
+    """Return each row's wanted relative error in the energy norm, or infinity for a row that counts as zero.
 
     Args:
         before: the `norms` of the right-hand sides bᵢ.
         after: the `norms` of the projections Qbᵢ.
         amplified: the `amplification` of each row.
-        tolerance: the wanted relative error of the largest row.
+        tolerance: the wanted relative error for the largest right-hand side.
         dtype: the dtype to which eigenvectors and rows were rounded.
     """
     xp, largest = amplified.__array_namespace__(), before.max()
-    # If all rows are zero, each row counts as zero.
     share = after / xp.where(largest > 0, largest, 1) * amplified
     noise = (after <= attainable(0, dtype) * before) | (share <= tolerance)
     return xp.where(noise, xp.inf, xp.minimum(tolerance / xp.where(noise, 1, share), 0.1))
@@ -138,8 +139,9 @@ def group_numbers(
 ) -> Int[np.ndarray, " m"]:
     """Divide distances into groups in geometric progression, and return the group of each distance.
 
-    The distances are Λ − λᵢ. If the largest is ρ times the least, the preconditioned matrix of each of s groups has the
-    condition number ρ^(1/2s). The number s minimises the cost of factorisations and of steps for all rows.
+    The distance of an eigenvalue λᵢ is Λ − λᵢ, where Λ is the lowest eigenvalue on the complement. If the largest
+    distance is ρ times the least, each of s groups has a preconditioned matrix with a condition number of at most
+    ρ^(1/2s). The number s minimises the cost of factorisations and of steps for all right-hand sides.
     """
     ratio = max(distance.max() / distance.min(), 1 + 1e-12)
 
@@ -152,7 +154,7 @@ def group_numbers(
 
 
 def shifts_between(values: Values, nearest: Shifts, farthest: Shifts) -> Shifts:
-    """Return a shift for each group: its distance from Λ is the geometric mean of the group's extreme distances."""
+    """Return each group's shift, whose distance from `first_beyond` is about √(``nearest`` · ``farthest``)."""
     xp = values.__array_namespace__()
     targets, below = first_beyond(values) - xp.sqrt(nearest * farthest), -0.1 * values[-1]
     if values.size == 1:
@@ -171,7 +173,7 @@ def middles_of_gaps(values: Values, targets: Shifts, otherwise: Scalar) -> Shift
 
 
 def unsolved(failed: int | str, total: int) -> str:
-    """Return the message that the solves for some rows did not converge."""
+    """Return the message that the linear solves for some eigenpairs did not converge."""
     return (
         f"derivative: the linear solves for {failed} of {total} eigenpairs did not converge, so their derivatives are "
         "NaN. Either k or an end of the interval cuts a cluster of eigenvalues, or the eigenpairs did not converge. "
@@ -185,12 +187,12 @@ def without_known(pencil: SymmetricPencil, vectors: Vectors) -> OfColumns:
     return lambda x: x - matmul(products_with_columns(vectors, mass(x)).T, vectors).T
 
 
-# Arrays as large as the eigenvectors are updated in place. Filling a new array of this size takes as long as a product
-# with it, because the operating system must provide memory.
+# Arrays as large as the eigenvectors are updated in place, because filling a new array of their size takes as long as a
+# product with it: the operating system must provide memory.
 def projected(
     pencil: SymmetricPencil, vectors: Vectors, rhs: Rows, tolerance: float, amplified: OfRows
 ) -> tuple[Rows, OfRows]:
-    """Return Q rhs, where Q = I − MΦΦᵀ, and the `wanted_errors` of its rows."""
+    """Return the projections Q rhsᵢ, where Q = I − MΦΦᵀ, and the wanted relative error of each solution."""
     lumped = pencil.mass.diagonal()
 
     def project(b: Rows, _: Array) -> tuple[Rows, OfRows]:
@@ -212,7 +214,6 @@ def cleaned(pencil: SymmetricPencil, vectors: Vectors, x: Rows) -> Rows:
 
 
 def _in_parts(project: Callable[..., tuple[Array, ...]], *rows: Array) -> tuple[Array, ...]:
-    """Project blocks of rows, one after another. The last block may overlap another, which is harmless."""
     size = even_size(len(rows[0]), _ROWS)
     starts, _ = row_blocks(len(rows[0]), size)
 
@@ -226,14 +227,14 @@ def _in_parts(project: Callable[..., tuple[Array, ...]], *rows: Array) -> tuple[
 
 
 def solve_in_blocks(
-    solver_of: Callable[[Int[Array, ""]], Callable[..., Columns]],  # group ↦ (rhs, wanted, *of_rows) ↦ x of one block
+    solver_of: Callable[[Int[Array, ""]], Callable[..., Columns]],  # returns the solver for a group's blocks
     size: int,  # the number of rows per block
     first: Int[np.ndarray, " groups"],  # the first row of each group of blocks
     rhs: Rows,
-    wanted: OfRows,  # the wanted error of each row; if infinite, the row is not solved
+    wanted: OfRows,  # the wanted error of each solution; if infinite, the solution is zero
     *of_rows: OfRows,
 ) -> Rows:
-    """Solve for blocks of rows, one after another."""
+    """Solve the linear systems for blocks of right-hand sides (rows), one block after another."""
     size = min(size, len(rhs))
     starts, _ = row_blocks(len(rhs), size)
     blocks = jnp.asarray(np.append(first // size, len(starts)))
@@ -244,7 +245,7 @@ def solve_in_blocks(
         def solve_block(number: Array, x: Rows) -> Rows:
             start = jnp.asarray(starts)[number]
             b, error, *own = (jax.lax.dynamic_slice_in_dim(each, start, size) for each in (x, wanted, *of_rows))
-            unsolved = start + np.arange(size) >= number * size  # the last block may overlap the previous one
+            unsolved = start + np.arange(size) >= number * size  # the last two blocks may overlap
             solution = solve(b.T, jnp.where(unsolved, error, jnp.inf), *own).T
             return jax.lax.dynamic_update_slice_in_dim(x, jnp.where(unsolved[:, None], solution, b), start, axis=0)
 

@@ -1,9 +1,9 @@
 """Linear solves with K − λᵢM on the complement of computed eigenvectors, all in JAX.
 
 The method is described in `hks_jax.eigen.adjoints.adjoint`: conjugate gradients with a factorisation of K − σM as
-preconditioner for each group of neighbouring eigenvalues. Groups are formed by index instead of value, so that shapes
-are static; by Weyl's law, the distribution of eigenvalues is regular enough. All products with the Jacobian at one
-point share the factorisations.
+preconditioner for each group of neighbouring eigenvalues. Eigenvalues are grouped by index instead of value, so that
+array shapes are static. By Weyl's law, eigenvalues are distributed so regularly that groups by index suffice. All
+products with the Jacobian at one point share the factorisations of K − σM.
 """
 
 from collections.abc import Callable
@@ -28,9 +28,9 @@ from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import matmul, products_with_columns
 
 BLOCK = 16
-"""The number of rows solved together."""
+"""The number of right-hand sides that conjugate gradients treat at once."""
 WINDOW = 32
-"""The number of eigenvectors nearest to a shift that every step projects out."""
+"""The number of eigenvectors nearest to a shift that every conjugate gradient step projects out."""
 _GROWTH = 4e7
 """The largest factor by which solves amplify rounding errors along computed eigenvectors; 1e4 to 1e5 is usual."""
 _MEMORY = 5e8
@@ -48,8 +48,9 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
     The solver supports every pencil that can be factorised: grids (mainly in 2D), meshes, and sparse matrices.
 
     Attributes:
-        tolerance: the error in the energy norm, relative to the largest row.
-        solves: the expected number of solves per preparation. For many solves, more factorisations are computed.
+        tolerance: the wanted error in the energy norm, relative to the largest right-hand side.
+        solves: the expected number of calls of `solve` per call of `prepare`. If many calls of `solve` are expected,
+            the solver factorises K − σM at more shifts σ, so that each call takes fewer steps.
 
     Examples:
         >>> solver = hj.ShiftInvert(adjoint=hj.FactorisedAdjoint(tolerance=1e-6))
@@ -108,7 +109,7 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         return x if clean_enough else complement.cleaned(pencil, vectors, x)
 
     def groups(self, dissection: Dissection, p: int, k: int, dtype: np.dtype) -> Groups:
-        """Group blocks of the first k of p rows by the distances of their middle rows; see `group_numbers`."""
+        """Return the first and the last row of each group of right-hand sides, which `group_numbers` determines."""
         start = np.arange(0, k, BLOCK)
         end = np.minimum(start + BLOCK, k)
         distance = self._distance(p, k, (start + end - 1) / 2)
@@ -121,7 +122,7 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
     # `InteriorAdjoint` overrides the following methods.
 
     def _distance(self, p: int, k: int, row: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-        """Return the distances of the rows' eigenvalues from the next one, up to a factor, by Weyl's law in 2D."""
+        """Return, by Weyl's law in 2D, numbers proportional to the distances of the rows' λᵢ from eigenvalue p + 1."""
         return p + 1 - row
 
     def _shifts(self, pencil: Any, values: Values, groups: Groups) -> Shifts:
@@ -131,9 +132,9 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
     def _amplified(self, pencil: Any, values: Values, k: int) -> OfRows:
         return complement.amplification(values, k)
 
-    # If r has a component along φⱼ by rounding, (K − λᵢM)(K − σM)⁻¹ multiplies it by (λⱼ − λᵢ)/(λⱼ − σ). This factor is
-    # large mainly for λⱼ near σ. So each step projects out only these φⱼ; the other φⱼ are projected out at restarts
-    # and at the end.
+    # If rounding leaves a component of the residual along a computed eigenvector φⱼ, each step multiplies this
+    # component by (λⱼ − λᵢ)/(λⱼ − σ), which is large mainly for λⱼ near σ. So each step projects out only the
+    # eigenvectors φⱼ with λⱼ nearest to σ. Other computed eigenvectors are projected out at restarts and at the end.
     def _solve_block(
         self, pencil: Any, values: Values, without_near: OfColumns, without_known: OfColumns, *of_block: Any
     ) -> Columns:
@@ -147,30 +148,32 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         return conjugate_gradients(product, precondition, b, wanted, clean=without_known).converged
 
 
-# The eigenvalues of the complement lie on both sides of the computed eigenvalues, so that K − λᵢM is indefinite there.
-# Let Λ₋ be the last eigenvalue of the complement below the computed eigenvalues, and Λ₊ the first above them. Let the
-# shift σ, like λᵢ, lie between Λ₋ and Λ₊. Then every λⱼ of the complement is above both σ and λᵢ, or below both. So
+# The eigenvalues on the complement of the computed eigenvectors lie on both sides of the computed eigenvalues, so that
+# K − λᵢM is indefinite. Let Λ₋ be the last eigenvalue on the complement below the computed ones, and Λ₊ the first
+# above. Let the shift σ, like λᵢ, lie between Λ₋ and Λ₊. Then each λⱼ on the complement is above both σ and λᵢ, or
+# below both. So
 #
 #     A = (K − σM)⁻¹ (K − λᵢM)
 #
-# has the eigenvalues (λⱼ − λᵢ)/(λⱼ − σ) > 0 on the complement. A is symmetric in the inner product xᵀMy. So conjugate
-# gradients in this inner product solve A xᵢ = (K − σM)⁻¹ bᵢ. Products with A use the exact K − λᵢM. So an inaccurate
-# factorisation slows down convergence, but does not change the solution.
+# has the eigenvalues (λⱼ − λᵢ)/(λⱼ − σ) > 0 on the complement. The matrix A is symmetric in the inner product xᵀMy, in
+# which conjugate gradients solve A xᵢ = (K − σM)⁻¹ bᵢ for the right-hand side bᵢ. Products with A use the exact
+# K − λᵢM. So an inaccurate factorisation of K − σM slows down convergence, but does not change the solution.
 #
-# Define the odds ω(λ) = (Λ₊ − λ)/(λ − Λ₋). The condition number of A is at most the ratio of ω(λᵢ) and ω(σ); for
-# example, if λᵢ < σ, the eigenvalues of A lie between (λᵢ − Λ₋)/(σ − Λ₋) and (Λ₊ − λᵢ)/(Λ₊ − σ). The odds replace the
-# distance Λ₊ − λ, to which they are proportional in the limit Λ₋ → −∞. Rows are grouped by their odds in geometric
-# progression, and the odds of a group's shift are the geometric mean.
+# Define the odds ω(λ) = (Λ₊ − λ)/(λ − Λ₋) of an eigenvalue λ. The condition number of the preconditioned matrix A is at
+# most the ratio of the odds ω(λᵢ) and ω(σ); for example, if λᵢ < σ, the eigenvalues of A lie between (λᵢ − Λ₋)/(σ − Λ₋)
+# and (Λ₊ − λᵢ)/(Λ₊ − σ). `group_numbers` divides the odds ω(λᵢ), instead of the distances Λ₊ − λᵢ, into groups; the
+# odds ω(σ) of a group's shift are the geometric mean of its extreme odds. In the limit Λ₋ → −∞, the odds ω(λᵢ) are
+# proportional to the distances Λ₊ − λᵢ.
 class InteriorAdjoint(FactorisedAdjoint):
     """Conjugate gradients in the inner product of M, with a factorisation of K − σM for each group of rows.
 
-    The pairs are the k pairs of the rows, ascending from the origin of a `LocatedPencil`, followed by guard pairs on
-    either side in any order. Missing guards are zero vectors with one of the computed eigenvalues. The error is
-    measured in the norm of M.
+    Of the p computed eigenpairs, the first k belong to the k right-hand sides, and ascend from the origin of a
+    `LocatedPencil`. Guard pairs on either side of the k pairs follow in any order. Zero vectors, with one of the
+    computed eigenvalues, replace guard pairs that do not exist. The error is measured in the norm of M.
     """
 
     def _distance(self, p: int, k: int, row: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-        """Return the odds of the rows, as if eigenvalues were equidistant with equally many guards on both sides."""
+        """Return the odds ω(λᵢ) of the rows' λᵢ, as if eigenvalues were equidistant, with (p − k)/2 guards per side."""
         others = (p - k) / 2
         return (k + others - row) / (row + others + 1)
 
@@ -178,7 +181,7 @@ class InteriorAdjoint(FactorisedAdjoint):
         (first, last), (low, high) = groups, _left(pencil, values)
         odds = (high - values) / (values - low)
         mean = jnp.sqrt(odds[first] * odds[last])
-        # If all computed eigenvalues are equal, use the gap between the origin and this eigenvalue.
+        # If all computed eigenvalues are equal, the shift is halfway between the origin and their common value.
         return complement.middles_of_gaps(jnp.sort(values), (high + mean * low) / (1 + mean), values[0] / 2)
 
     def _amplified(self, pencil: Any, values: Values, k: int) -> OfRows:
@@ -197,11 +200,11 @@ class InteriorAdjoint(FactorisedAdjoint):
         def product(x: Columns) -> tuple[Columns, Float[Array, " b"]]:
             return factor.solve(stiffness(x) - shifts * mass(x)), complement.SINGULAR * inner(x, x)
 
-        # Rounding leaves components along computed eigenvectors. A amplifies only components with λⱼ near σ.
+        # Rounding leaves components along computed eigenvectors φⱼ, of which A amplifies only those with λⱼ near σ.
         right = factor.solve(b)
         return conjugate_gradients(product, without_near, right, wanted, inner, without_known).converged
 
 
 def _left(pencil: LocatedPencil, values: Values) -> tuple[Scalar, Scalar]:
-    """Estimate Λ₋ and Λ₊, the eigenvalues of the complement nearest to the computed eigenvalues."""
+    """Estimate Λ₋ and Λ₊, the eigenvalues on the complement nearest to the computed eigenvalues."""
     return jnp.min(values) - pencil.spacing, jnp.max(values) + pencil.spacing

@@ -53,7 +53,7 @@ class ChebyshevFilter(Eigensolver[Pencil]):
 
     Attributes:
         tolerance: the relative residual at which a pair counts as converged.
-        block: the number of vectors filtered together. The workspace is proportional to this number.
+        block: the number of vectors filtered together. The size of the workspace is proportional to ``block``.
         max_rounds: the maximal number of rounds on the finest grid.
         mesh: the devices, as a `jax.sharding.Mesh` with one axis. Each device filters some of the vectors, and stores
             all vectors on a part of the grid (docs/devices.md). None means one device.
@@ -90,7 +90,7 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         return values, vectors, jnp.asarray(jnp.nan, values.dtype)
 
     def guards(self, k: int, n_dof: int) -> int:
-        """Return half of the number of spare vectors: as guards, they keep linear solves well conditioned."""
+        """Return the number of guard pairs that keep linear solves well conditioned: half of the additional vectors."""
         return max(8, int(_SPARE * k) // 2)
 
     def max_pairs(self, n_dof: int) -> int:
@@ -98,7 +98,7 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         return max(n_dof // 8 - self.block, 0)
 
     def plan(self, k: int, space: GridSpace) -> Plan:
-        """Return the sizes of the computation."""
+        """Return the number of vectors, and the other static settings of the subspace iteration, for k eigenpairs."""
         mesh = None if self.mesh is None else checked_mesh(self.mesh)
         together = self.block if mesh is None else self.block * mesh.size
         size = math.ceil((k + max(8, _SPARE * k)) / together) * together
@@ -127,7 +127,7 @@ _compiled = jax.jit(_lowest, static_argnames=("plan", "max_rounds", "report"))
 
 
 def _converge(grid: GridFilter, rounding: Array, state: FilterState, max_rounds: int, report: Report) -> FilterState:
-    """Return the state after the rounds on the finest grid. Report each round and, for large problems, each block."""
+    """Iterate on the finest grid until the pairs converge. Report each round and, for large problems, each block."""
     wanted = grid.plan.wanted
 
     def excess(state: FilterState) -> Float[Array, " wanted"]:
@@ -155,12 +155,12 @@ def _converge(grid: GridFilter, rounding: Array, state: FilterState, max_rounds:
 class Pace:
     """An estimate of the remaining time of a subspace iteration, from the convergence and cost of earlier rounds.
 
-    The estimate assumes that each round reduces the largest residual by the same factor. The time of a round is assumed
-    to be proportional to its number of matrix–vector products. The first estimate follows the first round.
+    The estimate assumes that each round reduces the largest residual by the same factor, and that the time of a round
+    is proportional to its number of matrix–vector products. No estimate exists before the end of the first round.
     """
 
     def __init__(self, excess: float) -> None:
-        """Begin with the largest residual, as a multiple of the residual that counts as converged."""
+        """Start the clock. ``excess`` is the largest residual, in units of the residual that counts as converged."""
         self._excess, self._factor = excess, math.nan
         self._seconds, self._last_work, self._work = math.nan, 1, 1
         self._begin = time.perf_counter()
@@ -172,13 +172,13 @@ class Pace:
         self._last_work, self._seconds, self._begin = self._work, now - self._begin, now
 
     def seconds_left(self, done: int = 0, work: int | None = None) -> float | None:
-        """Return the remaining seconds after `done` of `work` products of this round; None if unknown."""
+        """Return the remaining seconds after ``done`` of the current round's ``work`` products; None if unknown."""
         self._work = work or self._last_work
         if not self._factor > 1 or not self._excess > 1:
             return None
         rounds = math.ceil(math.log(self._excess) / math.log(self._factor))
-        # Later rounds filter fewer pairs. So the work of this round, if known, is a better estimate than that of the
-        # last round.
+        # Later rounds filter fewer pairs. So the number of products in the current round, if known, is a better
+        # estimate for later rounds than the number in the previous round.
         return (rounds - done / self._work) * self._seconds * self._work / self._last_work
 
 
@@ -193,5 +193,4 @@ def _nested(pencil: Pencil, plan: Plan) -> list[NodalPencil]:
 
 
 def _replicated(mesh: Mesh | None, grid: GridFilter) -> GridFilter:
-    """Copy the arrays to every device."""
     return grid if mesh is None else jax.jit(lambda x: x, out_shardings=NamedSharding(mesh, EVERYWHERE))(grid)

@@ -17,7 +17,6 @@ from hks_jax.fem.space import axis_colours
 from hks_jax.fem.stencil import Stencil
 
 _COLUMNS = 16
-"""The number of columns in one product."""
 
 
 @jax.jit
@@ -29,8 +28,8 @@ def coarsen(fine: NodalPencil) -> NodalPencil:
     axes = [axis_colours(n, 3, wraps) for n, wraps in zip(shape, fine.periodic, strict=True)]
     counts = [int(axis.max()) + 1 for axis in axes]
     padded = -(-math.prod(counts) // _COLUMNS) * _COLUMNS
-    # Neighbours have different colours; the colour of a neighbour that does not exist is −1. Only arrays along single
-    # axes are constants of the program, and the barriers keep XLA from folding constants.
+    # Neighbouring nodes have different colours; the colour of a neighbour that does not exist is −1. Only the colours
+    # along single axes are constants of the program: `optimization_barrier` keeps XLA from computing larger constants.
     colours = jnp.zeros((), jnp.float32)
     along = jax.lax.optimization_barrier([jnp.asarray(axis, jnp.float32) for axis in axes])
     for axis, (own, count) in enumerate(zip(along, counts, strict=True)):
@@ -45,8 +44,8 @@ def coarsen(fine: NodalPencil) -> NodalPencil:
         return tuple(to_rows(*restrict(image)) for image in fine.products()(raised))
 
     def coupled(images: Float[Array, "blocks b coarse"]) -> Stencil:
-        # Basis functions of one colour have disjoint neighbourhoods. So at each node, the image of their sum is the
-        # entry that couples the node to the only function nearby.
+        # Basis functions of one colour have disjoint neighbourhoods. So at each node, the image of the sum of all basis
+        # functions of one colour is the entry that couples the node to the only neighbouring function of this colour.
         entries = jnp.take_along_axis(images.reshape(padded, *shape), jnp.maximum(of_neighbour, 0), axis=0)
         return Stencil(jnp.where(of_neighbour >= 0, entries, 0), fine.periodic)
 
@@ -55,7 +54,8 @@ def coarsen(fine: NodalPencil) -> NodalPencil:
 
 
 def interpolate(fine: NodalPencil, x: Float[Array, "*coarse b"]) -> Float[Array, "*shape b"]:
-    """Interpolate multilinearly from every second node, and constantly beyond the last; 0 except at free nodes."""
+    """Interpolate multilinearly from every second node, with constants beyond the last; 0 at nodes that are not
+    free."""
     every_second = (slice(None, None, 2),) * len(fine.shape)
     weights = _interpolate(fine.domain[every_second][..., None].astype(x.dtype), fine.shape, fine.periodic)
     x = _interpolate(jnp.where(fine.free[every_second][..., None], x, 0), fine.shape, fine.periodic)

@@ -23,7 +23,7 @@ from hks_jax.fem.stencil import StencilOperator
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
 
 _GAIN = 20.0
-"""The polynomial's value at λᵢ. A larger value takes more products with K; a smaller value takes more projections."""
+"""The filter polynomial's value at λᵢ. A larger value needs fewer steps, but more products with K in each step."""
 _MOST_DEGREE = 60
 _WIDEST = 0.9
 """The largest lower end of the polynomial's band, as a fraction of its upper end."""
@@ -33,7 +33,7 @@ class FilteredAdjoint(Adjoint[Pencil]):
     """Conjugate gradients with a Chebyshev preconditioner, without a factorisation; for grids, mainly in 3D.
 
     Attributes:
-        tolerance: the error in the energy norm, relative to the largest row.
+        tolerance: the wanted error in the energy norm, relative to the largest right-hand side.
         block: the number of right-hand sides solved together.
 
     Examples:
@@ -65,7 +65,8 @@ class FilteredAdjoint(Adjoint[Pencil]):
         mass = space.restrict(nodal.lumped)
         quotients = values / jax.lax.map(lambda phi: jnp.sum(mass * phi * phi), vectors, batch_size=self.block)
         band = Band(jnp.minimum(jnp.max(quotients) * (1 + 1 / values.size), _WIDEST * high), high)
-        # Nearer to the band, the polynomial would not reach its gain, and the preconditioner might be indefinite.
+        # If a quotient were nearer to the band, the polynomial of degree `_MOST_DEGREE` would not reach `_GAIN`, and
+        # the preconditioner might be indefinite.
         nearest = (math.cosh(math.acosh(_GAIN) / _MOST_DEGREE) - 1) / 2
         quotients = jnp.minimum(quotients, band.low - nearest * (band.high - band.low))
         clean = complement.without_known(pencil, vectors)

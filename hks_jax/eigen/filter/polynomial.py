@@ -15,7 +15,7 @@ from hks_jax.linear.products import aligned
 _STEPS = 64
 """The number of Lanczos steps for the upper bound of the spectrum."""
 MOST_DEGREE = 1000
-"""The maximal degree. It suffices for a band that is 10⁵ times as wide as the interval below it."""
+"""The maximal degree of a polynomial: enough for a band 10⁵ times as wide as the interval below the band."""
 
 
 class Band(NamedTuple):
@@ -27,7 +27,7 @@ class Band(NamedTuple):
     def degree_for(self, value: Float[Array, "*b"], gain: float) -> Float[Array, "*b"]:
         """Return the degree at which the polynomial equals ``gain`` at a value below the band.
 
-        The degree is at most `MOST_DEGREE`. If a wide band needs a higher degree, pairs do not converge.
+        The degree is at most `MOST_DEGREE`. If a wide band needs a degree above `MOST_DEGREE`, pairs do not converge.
         """
         below = jnp.maximum(self.low - value, 0)
         degree = jnp.arccosh(jnp.asarray(gain, value.dtype)) / jnp.arccosh(1 + 2 * below / (self.high - self.low))
@@ -35,25 +35,28 @@ class Band(NamedTuple):
 
 
 # Let x be an approximate eigenvector with Rayleigh quotient λ and residual r = Kx − λMx. Let p be the Chebyshev
-# polynomial with |p| ≤ 1 on the band; p grows fast below the band. Then p(M⁻¹K)x/p(λ) is x plus a correction,
+# polynomial with |p| ≤ 1 on the damped band; p grows fast below the band. Then p(M⁻¹K)x/p(λ) is x plus a correction,
 #
 #     x + q(M⁻¹K) M⁻¹r,    q(z) = (p(z)/p(λ) − 1)/(z − λ),
 #
-# in which M⁻¹ acts only on the residual. So an approximate inverse, or single precision, does not change the limit
-# (residual-based filtering, R-ChFSI). Let the lumped mass D replace M. For a mode of eigenvalue μ on which D⁻¹M is the
-# factor β < 1, z becomes βμ, and the coefficient in D⁻¹r is β(μ − λ) instead of z − λ. The two agree to second order in
-# h²λ if the lumped quotient ζ = xᵀKx / xᵀDx replaces λ and the correction is scaled by ζ/λ: for β(μ) ≈ 1 − ch²μ,
+# in which M⁻¹ acts only on the residual. So an approximate inverse of M, or single precision, does not change the limit
+# of the iteration (residual-based filtering, R-ChFSI). Let the lumped mass D replace M, and let D⁻¹M multiply an
+# eigenvector with eigenvalue μ by β < 1. In the correction with D, the argument z of q becomes βμ, and D⁻¹r contains
+# the eigenvector with the factor β(μ − λ), while q assumes the factor z − λ. Both factors agree up to second order in
+# h²λ, where h is the node spacing, if the lumped quotient ζ = xᵀKx / xᵀDx replaces λ in q and the correction is scaled
+# by ζ/λ: for β(μ) ≈ 1 − ch²μ,
 #
-#     z − ζ = (μ − λ)(β − ch²λ + …) = β(μ − λ) · λ/ζ + ….
+#     z − ζ = (μ − λ)(β − ch²λ + …) = β(μ − λ) · ζ/λ + ….
 #
-# If the mesh is coarse in one direction only, β also depends on the direction of a mode, and βμ and μ may order the
-# modes near the edge of the band differently. If the mesh is too coarse for the wanted modes, other modes with β ≈ 3⁻ᵈ
-# and much larger μ have smaller values βμ. In both cases, W = Σⱼ (I − D⁻¹M)ʲ D⁻¹ replaces D⁻¹, which adds n terms of
-# the Neumann series of M⁻¹. Then βμ becomes ψ = (1 − (1 − β)ⁿ⁺¹)μ, at most n + 1 times as large. Since dψ/dμ = 1 − (n +
-# 2)(1 − β)ⁿ⁺¹, the scale ζ/λ becomes 1 − (n + 1)(1 − β)ⁿ⁺¹.
+# If the mesh is coarse in one direction only, the factor β also depends on the direction of an eigenvector, and the
+# values βμ near the edge of the band may have another order than the eigenvalues μ. If the mesh is too coarse for the
+# wanted eigenvectors, others with β ≈ 3⁻ᵈ in d dimensions and much larger μ have smaller values βμ. For such coarse
+# meshes, W = Σⱼ (I − D⁻¹M)ʲ D⁻¹ replaces D⁻¹, which adds n terms of the Neumann series of M⁻¹. With W, the eigenvalue
+# βμ of D⁻¹K becomes the eigenvalue ψ = (1 − (1 − β)ⁿ⁺¹)μ of WK, at most n + 1 times as large. Since the derivative
+# dψ/dμ is 1 − (n + 2)(1 − β)ⁿ⁺¹, the scale ζ/λ of the correction becomes 1 − (n + 1)(1 − β)ⁿ⁺¹.
 #
-# W may replace D⁻¹ everywhere. Since q < 0 on both sides of ζ, −q(D⁻¹K)D⁻¹ is also a symmetric positive definite
-# preconditioner for K − λM.
+# W may replace D⁻¹ everywhere. Since the polynomial q is negative on both sides of ζ, −q(D⁻¹K)D⁻¹ is also a symmetric
+# positive definite preconditioner for K − λM.
 def correction(
     pencil: NodalPencil,
     band: Band,
@@ -63,10 +66,11 @@ def correction(
     whole: Columns | float = 0.0,
     terms: Int[Array, ""] | int = 0,
 ) -> Columns:
-    """Return q(D⁻¹K) D⁻¹r for the residual r and the polynomial q of ζ. Here ζ is ``value``, but at most ``band.low``.
+    """Return the correction q(D⁻¹K) D⁻¹r for each residual r, where q is defined by ζ = min(``value``, ``band.low``).
 
-    If n = ``terms`` > 0, W replaces D⁻¹, and value and band refer to WK. If a column x of ``whole`` is not zero, the
-    residual's column must be Kx; then D⁻¹Kx − ζx replaces D⁻¹r, so that x plus the result is p(D⁻¹K)x / p(ζ).
+    If n = ``terms`` > 0, W replaces D⁻¹, and ``value`` and ``band`` refer to eigenvalues of WK. If a column x of
+    ``whole`` is not zero, the corresponding column of ``residual`` must be Kx, and D⁻¹Kx − ζx replaces D⁻¹r, so that x
+    plus the result is the filtered vector p(D⁻¹K)x / p(ζ).
     """
     dtype = residual.dtype
     stiffness, mass = (
@@ -85,7 +89,7 @@ def correction(
         w = inverse(residual / pencil.lumped[..., None].astype(dtype)) - aligned(reference.astype(dtype), whole) * whole
         return chebyshev_iteration(lambda z: inverse(stiffness(z)), w, band.low, band.high, reference, degree)
 
-    # The two cases are separate, so that XLA fuses a whole step if there are no further terms.
+    # The case ``terms`` = 0 is compiled separately, so that XLA fuses a whole step of the Chebyshev iteration.
     return jax.lax.cond(jnp.asarray(terms) > 0, lambda: run(further), lambda: run(lambda y: y))
 
 

@@ -22,27 +22,29 @@ from hks_jax.linear.accelerators import row_by_row
 from hks_jax.linear.loops import for_each
 
 _GAIN = 40.0
-"""The factor by which one round damps unwanted modes. With a larger factor, the error by the lumped mass dominates."""
+"""The factor by which one round damps unwanted modes. The error of the lumped mass would dominate a larger factor."""
 _SPREAD = 1e5
-"""The largest growth of the lowest mode relative to the edge of the band. Beyond this limit, rounding dominates."""
+"""The largest value at 0 of a filter polynomial that is at most 1 on the band; with a larger value, rounding
+dominates."""
 _LEAST_DEGREE = 4
 _MARGIN = 1.1
 """The safety factor of Weyl's law for the eigenvalue of the last vector."""
 _SPLIT, _APART = 0.02, 1.5
-"""The inverse mass gets further terms until two conditions hold. The relative shifts of similar eigenvalues differ by
-at most ``_SPLIT``. Modes above twice the last wanted eigenvalue have ψ ≥ ``_APART`` times that eigenvalue."""
+"""The Neumann series of the inverse mass gets more terms until the relative errors 1 − ψ(λ)/λ of eigenvalues λ near the
+last wanted eigenvalue differ by at most ``_SPLIT``, and until ψ(λ) is at least ``_APART`` times the last wanted
+eigenvalue for all λ above twice that eigenvalue."""
 _MOST_TERMS = 15
-"""The maximal number of further terms of the Neumann series of the inverse mass."""
+"""The maximal number of terms, after the first, of the Neumann series of the inverse mass."""
 
 Scalar = Float[Array, ""]
 Number = Int[Array, ""]
 Values = Float[Array, " m"]
 OwnRows = Float[Array, "own nodes"]
-"""The complete vectors that this device filters."""
+"""The vectors that this device filters, on all nodes of the grid."""
 
 
 class Plan(NamedTuple):
-    """The sizes of a computation; static."""
+    """The static settings of subspace iteration."""
 
     wanted: int  # the number of eigenpairs
     size: int  # the number of vectors, a multiple of `block`
@@ -53,22 +55,22 @@ class Plan(NamedTuple):
 
 
 class FilterState(NamedTuple):
-    """The state between two rounds."""
+    """The state of subspace iteration between two rounds."""
 
     values: Values  # Ritz values θ, ascending
     vectors: Float[Array, "m nodes"]  # M-orthonormal Ritz vectors; each of several devices has a slab of them
     residuals: Values  # ‖Kx − θMx‖/‖Mx‖
     lumped_values: Values  # xᵀKx / xᵀDx, where D is the lumped mass
-    terms: Number  # the number of further terms of the Neumann series
+    terms: Number  # the number of terms, after the first, of the Neumann series
     rounds: Number  # the number of rounds so far on this grid
 
 
 class Filtering(NamedTuple):
-    """The polynomials of a round."""
+    """The filter polynomials of a round of subspace iteration."""
 
     band: Band  # the damped interval
-    terms: Number  # the number of further terms of the Neumann series
-    degrees: Int[Array, " blocks"]  # the degree for each block; 0 if all its vectors have converged
+    terms: Number  # the number of terms, after the first, of the Neumann series
+    degrees: Int[Array, " blocks"]  # the degree of each block's polynomial; 0 if the whole block has converged
     values: Values  # the value ψ of each vector, at which its polynomial is 1
     factor: Values  # the factor by which each vector's correction is scaled
 
@@ -82,7 +84,7 @@ class GridFilter(eqx.Module):
 
     @property
     def slabs(self) -> Slabs | None:
-        """The slabs into which the grid is divided between rounds; None on one device."""
+        """The parts of the grid on which several devices store vectors between two rounds; None on one device."""
         return self.pencil.cut(self.plan.mesh)
 
     @jax.jit
@@ -131,10 +133,10 @@ class GridFilter(eqx.Module):
     def improve_told(
         self, rounding: Scalar | None, state: FilterState, done: Callable[[int, int], Any] | None = None
     ) -> FilterState:
-        """Filter the blocks that have not converged (all blocks if ``rounding`` is None), then apply Rayleigh–Ritz.
+        """Filter the blocks of vectors that have not converged (all if ``rounding`` is None), then apply Rayleigh–Ritz.
 
         Outside `jit` and on one device, the round can be interrupted between two blocks. After each block, ``done``
-        receives the number of products so far and the number of all products. `improve` is the compiled version.
+        receives the numbers of products with K in this round, so far and in total. `improve` is the compiled version.
         """
         slabs, plan, layout = self.slabs, self.plan, _layout(self.slabs)
 
@@ -158,17 +160,17 @@ class GridFilter(eqx.Module):
 
     @jax.jit
     def choose(self, rounding: Scalar | None, state: FilterState) -> Filtering:
-        """Return the polynomials of a round: the damped band, and their degrees."""
+        """Return the polynomials of a round: the band that they damp, the degree for each block, and further data."""
         plan = self.plan
         spare = jnp.arange(plan.size) >= plan.wanted
         terms, filtered_values, factor = _lumping(plan, state)
         high = (1 + terms).astype(self.high.dtype) * self.high
-        # The spare vectors may be far from eigenvectors; then the band begins at an estimate from Weyl's law.
+        # Weyl's law limits the lower end of the band, because the vectors that are not wanted may be inaccurate.
         edge = _MARGIN * filtered_values[plan.wanted - 1] * (plan.size / plan.wanted) ** (2 / len(self.pencil.shape))
         low = jnp.minimum(jnp.minimum(jnp.max(filtered_values), edge), high / 2)
         band = Band(low, high)
         left = spare | (True if rounding is None else ~(self.excess(rounding, state) <= 1))
-        # The spare vectors need no higher degree than the last wanted vector.
+        # For vectors beyond the wanted ones, the degree of the last wanted vector suffices.
         goal = jnp.where(spare, filtered_values[plan.wanted - 1], filtered_values)
         most = band.degree_for(jnp.zeros_like(low), _SPREAD)
         degrees = jnp.ceil(jnp.clip(band.degree_for(goal, _GAIN), _LEAST_DEGREE, jnp.maximum(most, _LEAST_DEGREE)))
@@ -177,7 +179,7 @@ class GridFilter(eqx.Module):
 
     @partial(jax.jit, donate_argnames="vectors")
     def filter_block(self, chosen: Filtering, values: Values, number: Number, own: Number, vectors: OwnRows) -> OwnRows:
-        """Filter one block of rows: block `number` of all blocks, which is block `own` of this device."""
+        """Filter the block of vectors with index ``number`` among all blocks and ``own`` among this device's blocks."""
         pencil, block, products = self.pencil, self.plan.block, self.pencil.products()
         band, degree = chosen.band, chosen.degrees[number]
 
@@ -186,7 +188,7 @@ class GridFilter(eqx.Module):
             theta, zeta, scale = (
                 jax.lax.dynamic_slice_in_dim(v, number * block, block) for v in (values, chosen.values, chosen.factor)
             )
-            # The residual of a vector in the band is not small, so the polynomial is applied to the vector itself.
+            # If the quotient ζ of x is in the damped band, the residual is large, and the polynomial is applied to x.
             inside = zeta > band.low
             image, moved = products(x)
             residual = image - jnp.where(inside, 0, theta * moved)
@@ -202,7 +204,7 @@ class GridFilter(eqx.Module):
 
     @partial(jax.jit, donate_argnames="vectors")
     def ritz(self, vectors: Float[Array, "m nodes"], terms: Number, rounds: Number) -> FilterState:
-        """Return the state whose vectors are the Ritz vectors of the rows."""
+        """Return the state with the Ritz vectors of the subspace that the given vectors span."""
         slabs, block = self.slabs, self.plan.block
         own = self.pencil.own(slabs)
         values, vectors = subspace.rayleigh_ritz(own, slabs, block, vectors)
@@ -215,9 +217,9 @@ class GridFilter(eqx.Module):
 
 
 def _lumping(plan: Plan, state: FilterState) -> tuple[Number, Values, Values]:
-    """Return the number of further terms in the inverse mass, and each vector's ψ and factor of correction."""
+    """Return the fields ``terms``, ``values`` and ``factor`` of `Filtering`."""
     values, wanted = state.values, state.values[plan.wanted - 1]
-    # 1 − β of each mode: the relative decrease of its eigenvalue by the lumped mass.
+    # The lumped mass decreases the eigenvalue of each mode by a relative amount, 1 − β.
     missing = 1 - jnp.where(values > 0, state.lumped_values / jnp.where(values > 0, values, 1), 1)
     powers = jnp.arange(1, _MOST_TERMS + 2, dtype=values.dtype)[:, None]
     lost = missing[None] ** powers
@@ -225,12 +227,11 @@ def _lumping(plan: Plan, state: FilterState) -> tuple[Number, Values, Values]:
     spread = jnp.max(jnp.where(near, lost, 0), axis=1) - jnp.min(jnp.where(near, lost, jnp.inf), axis=1)
     beyond = jnp.min(jnp.where((values > 2 * wanted)[None], (1 - lost) * values[None], jnp.inf), axis=1)
     enough = (spread <= _SPLIT) & (beyond >= _APART * wanted)
-    # The number never decreases, because the modes that further terms suppress would return.
+    # The number of terms never decreases, because modes that more terms have damped would grow again with fewer terms.
     terms = jnp.maximum(state.terms, jnp.where(jnp.any(enough), jnp.argmax(enough), _MOST_TERMS))
     return terms, (1 - lost[terms]) * values, 1 - (terms + 1).astype(values.dtype) * lost[terms]
 
 
 def _layout(slabs: Slabs | None) -> FilterState:
-    """Return the sharding of a state: vectors are divided into slabs; every device has the other arrays."""
     vectors = EVERYWHERE if slabs is None else PartitionSpec(None, slabs.name)
     return FilterState(EVERYWHERE, vectors, EVERYWHERE, EVERYWHERE, EVERYWHERE, EVERYWHERE)  # type: ignore[arg-type]

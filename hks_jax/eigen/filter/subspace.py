@@ -1,8 +1,8 @@
 """A subspace of nodal functions, stored as rows on one device or several, and blockwise Rayleigh–Ritz in it.
 
-A filter needs complete functions, a few on each device. Rayleigh–Ritz needs all functions on a part of the grid.
-Between rounds, each device stores all vectors on its slab, (m, nodes of the slab). For the filters, device i of p gets
-the blocks i, i + p, i + 2p, … of rows; this balances the load, because low modes converge first.
+A filter needs a few functions on the whole grid, and Rayleigh–Ritz needs all functions on a part of the grid. Between
+rounds, each device stores all functions on its slab, (m, nodes of the slab). For the filters, device i of p gets the
+blocks i, i + p, i + 2p, … of rows, which balances the load, because low modes converge first.
 
 ``slabs`` is None on a single device, where no communication is needed.
 """
@@ -26,14 +26,14 @@ from hks_jax.linear.products import matmul
 
 EVERYWHERE = PartitionSpec()
 _CHUNK = 1 << 14
-"""The number of nodes at which vectors are rotated together."""
+"""The number of nodes at which Ritz vectors are computed at once."""
 
 Values = Float[Array, " m"]
 Rows = Float[Array, "m nodes"]
 
 
 def shared(slabs: Slabs | None, function: Callable, in_specs: Any, out_specs: Any) -> Callable:
-    """Return the function, applied by every device to its share."""
+    """Return the function that every device applies to its own parts of the arrays; see `jax.shard_map`."""
     if slabs is None:
         return function
     # `check_vma` cannot verify loops of different lengths, nor that results agree on all devices.
@@ -48,7 +48,7 @@ def own_blocks(slabs: Slabs | None, count: int) -> Int[Array, " own"]:
 
 
 def to_own_rows(slabs: Slabs | None, block: int, x: Float[Array, "m slab"]) -> Float[Array, "own nodes"]:
-    """Return this device's blocks of complete rows, given the vectors in slabs."""
+    """Return the blocks of rows that this device filters, on the whole grid, given all rows on this device's slab."""
     if slabs is None:
         return x
     m, width = x.shape
@@ -58,7 +58,7 @@ def to_own_rows(slabs: Slabs | None, block: int, x: Float[Array, "m slab"]) -> F
 
 
 def to_slabs(slabs: Slabs | None, block: int, rows: Float[Array, "own nodes"]) -> Float[Array, "m slab"]:
-    """Return all vectors on this device's slab."""
+    """Return all rows on this device's slab, given the blocks of rows that this device has filtered."""
     if slabs is None:
         return rows
     missing = math.prod(slabs.padded_shape) - rows.shape[1]
@@ -73,13 +73,13 @@ def block_of(x: Rows, number: Array, block: int, shape: tuple[int, ...]) -> Floa
 
 
 def rayleigh_ritz(pencil: NodalPencil, slabs: Slabs | None, block: int, x: Rows) -> tuple[Values, Rows]:
-    """Return the Ritz values in ascending order and the M-orthonormal Ritz vectors as rows, on this device's slab."""
+    """Return ascending Ritz values and M-orthonormal Ritz vectors as rows; each device gets its slab of the vectors."""
     m, nodes = x.shape
     products = pencil.products()
 
     def among_rows(number: Array) -> tuple[Array, ...]:
         images = products(block_of(x, number, block, pencil.shape))
-        # Images stay columns. If they were rows, XLA would compute stencils in that layout, seven times as slowly.
+        # The images Kx and Mx stay columns; as rows, XLA would compute them in row-major layout, seven times as slowly.
         return tuple(matmul(x, image.reshape(nodes, block)) for image in images)
 
     both = jax.lax.map(among_rows, jnp.arange(m // block))

@@ -23,7 +23,7 @@ from hks_jax.linear.conjugate_gradients import conjugate_gradients
 from hks_jax.traced import is_traced
 
 _BLOCK = 16
-"""The number of columns solved together: enough for fast products, and few enough for the cache."""
+"""The number of right-hand sides per block: enough for fast products, and few enough for the cache."""
 
 
 class HostAdjoint(Adjoint[Pencil]):
@@ -32,7 +32,7 @@ class HostAdjoint(Adjoint[Pencil]):
     Under `jit` and `vmap`, the solver runs in a host callback, one problem at a time.
 
     Attributes:
-        tolerance: the error in the energy norm, relative to the largest row.
+        tolerance: the wanted error in the energy norm, relative to the largest right-hand side.
 
     Examples:
         >>> solver = hj.ShiftInvert(adjoint=hj.HostAdjoint(tolerance=1e-6))

@@ -39,8 +39,8 @@ def inertia_on_host(K: csc_matrix, M: csc_matrix, shift: float) -> tuple[int, bo
 def host_matrices(pencil: SymmetricPencil) -> tuple[tuple[Array, ...], Callable[..., tuple[csc_matrix, csc_matrix]]]:
     """Return arrays of K, M and the null vectors of K, and a function that makes SciPy matrices from such arrays.
 
-    The matrices are float64. For a null vector v, rounding errors in Kv would act as a potential. These errors are
-    subtracted from the diagonal if each node belongs to exactly one null vector.
+    The matrices are float64. For a null vector v, rounding errors in Kv would act as a potential. If each node belongs
+    to exactly one null vector, the rounding errors in Kv are subtracted from the diagonal of K.
     """
     (data_k, pattern_k), (data_m, pattern_m) = pencil.stiffness.triplets(), pencil.mass.triplets()
     n = pencil.size

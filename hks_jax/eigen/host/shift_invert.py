@@ -24,7 +24,7 @@ from hks_jax.traced import is_traced
 HostPairs = tuple[np.ndarray, np.ndarray, float]
 
 _ROUNDS = 20
-"""The maximal number of ARPACK runs. Each run after the first finds at least one missed eigenvalue."""
+"""The maximal number of ARPACK runs. Each run of ARPACK after the first searches for missed eigenvalues."""
 _TOLD = 25
 """The number of solves between two reports."""
 
@@ -38,8 +38,8 @@ class ShiftInvert(Eigensolver[Pencil]):
     Attributes:
         tolerance: the relative residual at which a pair counts as converged; ARPACK itself runs to machine precision.
         max_restarts: the maximal number of implicit restarts.
-        basis: the size of the Lanczos basis; None means 2k + 20. The size is raised if it is not more than the number
-            of pairs, which for derivatives includes guard pairs.
+        basis: the number of vectors in the Lanczos basis; None means 2k + 20. The solver enlarges a basis that does not
+            exceed the number of computed pairs, which for derivatives includes guard pairs.
 
     Examples:
         >>> sparse = hj.eigenpairs(field, k=12, solver=hj.ShiftInvert(basis=30))
@@ -70,12 +70,13 @@ class ShiftInvert(Eigensolver[Pencil]):
 
         def solve(volume: ArrayLike, *data: ArrayLike) -> tuple[np.ndarray, ...]:
             K, M = matrices(*data)
-            # K + sM is positive definite for any s > 0; s is small relative to Weyl's λ₁ or a typical eigenvalue.
+            # K + sM is positive definite for any shift s > 0. The shift is small relative to the lowest positive
+            # eigenvalue by Weyl's law or, if that is unknown, relative to the median of Kᵢᵢ/Mᵢᵢ.
             if dimension is None or not np.isfinite(volume):
                 shift = 1e-3 * float(np.median(K.diagonal() / M.diagonal()))
             else:
                 shift = 0.1 * (2 * np.pi) ** 2 / float(np.asarray(volume)) ** (2 / dimension)
-            # Threads make ARPACK's products with the basis hardly faster, and slower if the cores are busy.
+            # More BLAS threads hardly accelerate ARPACK's products with its basis, and slow them down on busy cores.
             with threadpool_limits(1, user_api="blas"):
                 return tuple(np.asarray(result, dtype) for result in self._lanczos(K, M, k, shift, report))
 
@@ -141,8 +142,8 @@ class ShiftInvert(Eigensolver[Pencil]):
 
 
 # At a restart, ARPACK keeps the converged vectors and half of the remaining basis; each restart takes a few additional
-# solves. For k from 10 to 200, it restarted once on planar domains, and three or four times on cubes with multiple
-# eigenvalues, where the first estimate is too small by a factor of 1.7.
+# solves. For k from 10 to 200, ARPACK restarted once on planar domains. On cubes with multiple eigenvalues, ARPACK
+# restarted three or four times, and the first estimate of the total number of solves was too small by a factor of 1.7.
 def expected_solves(done: int, basis: int, wanted: int) -> int:
     """Return the expected total number of solves, if the current restart (or the first one) is the last."""
     restart = (basis - wanted) // 2 + 4
@@ -150,7 +151,6 @@ def expected_solves(done: int, basis: int, wanted: int) -> int:
 
 
 def _padded(values: np.ndarray, vectors: np.ndarray, k: int, complete_below: float) -> HostPairs:
-    """Return the eigenvalues in ascending order and the eigenvectors as rows, padded with NaN to k pairs."""
     order, missing = np.argsort(values), k - values.size
     return (
         np.pad(values[order], (0, missing), constant_values=np.nan),

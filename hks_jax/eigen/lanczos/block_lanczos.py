@@ -38,7 +38,7 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
 
     Attributes:
         tolerance: the relative residual at which a pair counts as converged.
-        block: the number of vectors per Lanczos block. Multiplicities may exceed this number.
+        block: the number of vectors per Lanczos block, which multiplicities of eigenvalues may exceed.
         slice_size: the number of eigenvalues per slice; None means an automatic choice.
 
     Examples:
@@ -68,7 +68,7 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
         def step(both: tuple[SlicingState, Stored]) -> tuple[SlicingState, Stored]:
             factor, searchable, both = cut(problem, dissection, plan, *both)
             both = when(searchable, partial(search, problem, factor, plan), both)
-            if report is not silent and not is_traced(both):  # for a report, the host must wait for the numbers
+            if report is not silent and not is_traced(both):  # a report makes the host wait for the device
                 known, bound = min(int(both[0].known), k), float(both[0].complete_below)
                 report(f"{known} of {k} eigenpairs, and all eigenvalues below {bound:.6g}")
             return both
@@ -88,7 +88,7 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
         return max((n_dof - 16 * self.block) // 4, 0)
 
     def plan(self, k: int, nulls: int = 0) -> Plan:
-        """Return the sizes of a computation of k eigenvalues; the first ``nulls`` eigenvalues are zero."""
+        """Return the slice size and other static settings for k eigenvalues, of which the first ``nulls`` are zero."""
         slices = max(round(k / (self.slice_size or SLICE)), 1)
         size = math.ceil(1.06 * k / slices) + 2
         return Plan(k, self.block, size, 3 * slices + 12, self.tolerance, nulls)
@@ -118,7 +118,7 @@ def expected(pencil: SymmetricPencil, plan: Plan) -> Problem:
 def _lowest(
     pencil: SymmetricPencil, values: Float[Array, " capacity"], vectors: Stored, bound: Float[Array, ""], k: int
 ) -> RawPairs:
-    """Return the k lowest computed pairs (NaN for missing pairs), and the bound (NaN if a pair was found twice)."""
+    """Return the k lowest pairs (NaN if missing) and the certified bound (NaN if an eigenvector was found twice)."""
     order = jnp.argsort(values)[:k]
     values, vectors = values[order], vectors[order]
     known = jnp.isfinite(values)

@@ -14,7 +14,7 @@ from hks_jax.linear.operators import OfColumns
 from hks_jax.linear.products import gram, matmul, products_with_columns
 
 _PIECE = 128
-"""The number of rows per piece. Projections use complete pieces, and skip empty ones."""
+"""The number of basis vectors per `Piece`. Projections use whole pieces of the basis, and skip empty pieces."""
 _SMALL = 1e-7
 """The largest components that may be projected out in single precision; the remainder is then at rounding level."""
 _NODES = 2048
@@ -36,9 +36,9 @@ Small = Float[Array, "b b"]
 def begin(known: Float[Array, "w n_dof"], size: int, block: int) -> Basis:
     """Return a basis that begins with the known vectors and has room for ``size`` rows; the other rows are zero.
 
-    The number of known vectors and the size are multiples of ``block``, the number of rows written at once. On
-    accelerators, the basis is a single array, because skipping empty pieces would take longer than computing with them.
-    On accelerators, basis vectors are columns, as in blocks, so that no kernel has to transpose.
+    The number of known vectors and ``size`` are multiples of ``block``, the number of vectors that `write` appends. On
+    accelerators, the basis is a single array, because skipping its unused parts would take longer than computing with
+    them. On accelerators, basis vectors are columns, as in Lanczos blocks, so that no kernel has to transpose.
     """
     if accelerators.at_hand():
         return jnp.pad(known.T, ((0, 0), (0, size - len(known))))
@@ -55,7 +55,7 @@ def write(basis: Basis, block: Block, row: Int[Array, ""]) -> Basis:
     """Write the b columns of a block as rows of the basis, from ``row`` on, which is a multiple of b."""
     if not isinstance(basis, tuple):
         return jax.lax.dynamic_update_slice_in_dim(accelerators.row_by_row(basis), block, row, axis=1)
-    # The barrier keeps XLA from repeating the transposition for each piece.
+    # The barrier keeps XLA from transposing the block again for each piece of the basis.
     block, written = jax.lax.optimization_barrier(block.T), []
     for piece, at in zip(basis, _starts(basis), strict=True):
         size = len(piece.rows)
@@ -65,10 +65,10 @@ def write(basis: Basis, block: Block, row: Int[Array, ""]) -> Basis:
     return tuple(written)
 
 
-# One step of shift-invert Lanczos amplifies a block's component along a converged eigenvector 10 to 100 times. So after
-# two steps, a block x has components c = VᵀMx of 1e-14 to 1e-9 along the basis V, by rounding. The sums c need double
-# precision, because their rounding errors would otherwise be as large as c. Single precision suffices to subtract Vc,
-# with an error of 6e-8 c. If c is large, because the shift is close to an eigenvalue, V is used in double precision.
+# One step of shift-invert Lanczos amplifies a block's component along a converged eigenvector 10 to 100 times. So in
+# two steps, rounding errors in a block x grow to components c = VᵀMx of 1e-14 to 1e-9 along the basis V. The sums for c
+# need double precision, because their rounding errors would otherwise be as large as c. Single precision suffices to
+# subtract the projection Vc from x, unless c is large because the shift is close to an eigenvalue.
 def within(basis: Basis, images: Float[Array, "n_dof c"], filled: Int[Array, ""]) -> Float[Array, "n_dof c"]:
     """Return VVᵀMx, the projection of columns x on the first ``filled`` basis vectors V, given ``images`` = Mx."""
     if not isinstance(basis, tuple):
@@ -108,7 +108,7 @@ def combined(mix: Float[Array, "q m"], basis: Basis) -> Float[Array, "q n_dof"]:
     mixes = jnp.split(mix, _starts(basis)[1:], axis=1)
 
     def some(number: Array, sums_so_far: Float[Array, "q n_dof"]) -> Float[Array, "q n_dof"]:
-        at = jnp.minimum(number * width, n - width)  # the last range may overlap the previous one
+        at = jnp.minimum(number * width, n - width)  # the last two ranges of nodes may overlap
         parts = [jax.lax.dynamic_slice_in_dim(piece.rows, at, width, axis=1) for piece in basis]
         sums = sum(map(matmul, mixes, parts), jnp.zeros((), mix.dtype))
         return jax.lax.dynamic_update_slice_in_dim(sums_so_far, sums, at, axis=1)
@@ -117,16 +117,14 @@ def combined(mix: Float[Array, "q m"], basis: Basis) -> Float[Array, "q n_dof"]:
 
 
 def _starts(basis: Basis) -> list[int]:
-    """Return the first row of each piece."""
     return list(accumulate((len(piece.rows) for piece in basis[:-1]), initial=0))
 
 
 def _put(
     rows: Float[Array, "rows n_dof"], block: Float[Array, "b n_dof"], place: Int[Array, ""], inside: Bool[Array, ""]
 ) -> Float[Array, "rows n_dof"]:
-    """Write the block into the rows if ``inside``; otherwise return the rows unchanged."""
     block = block.astype(rows.dtype)
-    # A loop of at most one iteration touches only the piece that contains the block; a mask would touch every piece.
+    # A loop of at most one iteration writes only to the block's piece of the basis; a mask would write to every piece.
     return jax.lax.fori_loop(
         0, inside.astype(int), lambda _, rows: jax.lax.dynamic_update_slice_in_dim(rows, block, place, axis=0), rows
     )
@@ -160,7 +158,7 @@ def orthonormal(mass: OfColumns, x: Block) -> tuple[Block, Block, Small]:
     """Return M-orthonormal columns y, My, and the factor R of x = yRᵀ.
 
     XLA's operations factorise the Gram matrix by its eigenvalues; CUDA kernels use a pivoted Cholesky factorisation,
-    which is faster on GPUs. Both methods bound the divisors from below, so that no entry becomes infinite.
+    which is faster on GPUs. In both factorisations, divisors have a lower bound, so that no entry becomes infinite.
     """
     identity = jnp.asarray(np.eye(x.shape[1], dtype=x.dtype))  # a constant, so that no kernel computes it
 

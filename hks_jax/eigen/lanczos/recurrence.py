@@ -18,7 +18,7 @@ from hks_jax.linear.products import matmul, products_with_columns
 from hks_jax.traced import is_traced
 
 _STRETCH = 16
-"""The number of steps per compiled call outside `jit` on a CPU. Between calls, the computation can be interrupted."""
+"""The number of Lanczos steps per compiled call outside `jit` on a CPU; a user can interrupt between two calls."""
 
 Known = Float[Array, "w n_dof"]
 RitzPairs = tuple[Float[Array, " ritz"], Float[Array, "ritz n_dof"]]
@@ -30,17 +30,15 @@ class ShiftedSolve(NamedTuple):
 
     factor: Factorisation  # the factorisation of K − σM
     shift: Float[Array, ""]  # σ
-    passes: Int[Array, ""] | None  # the number of solves, 1 or 2; None is 1, without compiling the second
+    passes: Int[Array, ""] | None  # the number of solves per step: 1, or 2 with refinement; None means always 1
 
 
 class _Recurrence(NamedTuple):
-    """The state of the recurrence."""
-
     basis: Basis  # M-orthonormal rows: the known eigenvectors, then the blocks so far; the other rows are zero
     before: Block  # the last block in the basis
-    block: Block  # the following block
-    image: Block  # the image of this block under M
-    coupling: Small  # the coupling of the two blocks
+    block: Block  # the next block, which is not yet in the basis
+    image: Block  # the product of M and `block`
+    coupling: Small  # the matrix that couples `before` and `block`
     # the diagonal and subdiagonal blocks of the block tridiagonal matrix VᵀM(K − σM)⁻¹MV, where V has the blocks so far
     matrix: Float[Array, "steps two b b"]
 
@@ -49,7 +47,7 @@ def block_lanczos(
     pencil: SymmetricPencil,
     shifted: ShiftedSolve,
     start: Block,  # any vectors, from which the first block is made
-    known: Known,  # M-orthonormal eigenvectors or zero rows; w is a multiple of b and may be 0
+    known: Known,  # M-orthonormal eigenvectors or zero rows; their number w is 0 or a multiple of the block size b
     room: int,  # the maximal number of blocks; static
     steps: int | Int[Array, ""],  # the number of blocks to compute, even; under `jit`, `room` blocks are computed
     wanted: int,
@@ -57,11 +55,11 @@ def block_lanczos(
     """Run block Lanczos on (K − σM)⁻¹M, orthogonal to known eigenvectors.
 
     The recurrence keeps consecutive blocks orthogonal. In double precision, only every second step orthogonalises
-    against the whole basis, but then for two blocks at once. Thus the basis is read half as often, and stays
-    M-orthonormal to rounding.
+    against the whole basis, but for two blocks at once. The basis is then read half as often as with orthogonalisation
+    in every step, and stays M-orthonormal to rounding.
     """
     state, traced = _begin(pencil, start, known, room), is_traced(shifted)
-    # Under `jit`, the loop takes `room` steps. If the number varied in a batch, each iteration would copy the state.
+    # Under `jit`, `room` steps are taken, because each step would copy the state if the number varied in a batch.
     steps = room if traced else int(steps)
     if not traced and shifted.passes is not None and int(shifted.passes) == 1:
         shifted = shifted._replace(passes=None)
@@ -75,7 +73,6 @@ def block_lanczos(
 
 @jit_quickly(static_argnames="room")
 def _begin(pencil: SymmetricPencil, start: Block, known: Known, room: int) -> _Recurrence:
-    """Return the initial state, whose first block is orthogonal to the known vectors."""
     mass, block, b = pencil.mass.of_columns(), start, start.shape[1]
     for _ in range(2 if len(known) else 0):
         block = block - matmul(products_with_columns(known, mass(block)).T, known).T
@@ -92,14 +89,14 @@ def _advance(
     shifted: ShiftedSolve,
     state: _Recurrence,
     offset: int,
-    alone: bool,
+    alone: bool,  # whether there are only two steps, which need no loop
     first: int | Array,
     last: int | Array,
 ) -> _Recurrence:
-    """Take the steps first to last − 1, or two steps if ``alone``. The blocks begin at row ``offset`` of the basis."""
-    # If an eigenvalue is close to the shift, its Ritz value θ may be 1000 times as large as the others. A step
-    # amplifies the rounding error along this eigenvector 1000 times. So in float32, every step orthogonalises against
-    # the whole basis.
+    """Take the Lanczos steps ``first``, …, ``last`` − 1, whose blocks begin at row ``offset`` of the basis."""
+    # If an eigenvalue is close to the shift, its Ritz value θ may be 1000 times as large as the others, and a step
+    # amplifies rounding errors along its eigenvector 1000 times. So in float32, every step orthogonalises against the
+    # whole basis.
     every = 2 if state.block.dtype == jnp.float64 else 1
     two = accelerators.at_hand()
 
@@ -107,7 +104,7 @@ def _advance(
         steps = _stepping(pencil, shifted, offset)
 
         def turn(number: Array, state: _Recurrence) -> _Recurrence:
-            if two:  # which of the two steps projects is known statically
+            if two:  # it is static which of two steps orthogonalises against the basis
                 return steps(2 * number, state, (every == 1, True))
             return steps(number, state, ((number + 1) % every == 0,))
 
@@ -115,7 +112,7 @@ def _advance(
         return turn(jnp.asarray(ends[0]), state) if alone else jax.lax.fori_loop(*ends, turn, state)
 
     if two and not alone and shifted.passes is not None:
-        # Then the host waits for the number of passes only once, instead of in each step.
+        # Outside the loop, the condition on the number of passes makes the host wait for the device only once.
         once = partial(advance, shifted._replace(passes=None))
         return jax.lax.cond(_in_any(shifted.passes > 1), partial(advance, shifted), once, state)
     return advance(shifted, state)
@@ -124,7 +121,7 @@ def _advance(
 def _stepping(
     pencil: SymmetricPencil, shifted: ShiftedSolve, offset: int
 ) -> Callable[[Array, _Recurrence, tuple[bool | Array, ...]], _Recurrence]:
-    """Return a function that takes steps, given the index of the first, the state, and whether each step projects."""
+    """Return a function that takes a few Lanczos steps; flags tell which steps orthogonalise against the basis."""
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
     factor, shift, passes = shifted
 
@@ -139,7 +136,7 @@ def _stepping(
             x = factor.solve(rhs)
             return x + factor.solve(residual_of(x))
 
-        # With a loop, the solve is compiled only once.
+        # A loop over the passes compiles the triangular solves only once.
         def refine(done: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
             x, residual = state
             x = x + factor.solve(residual)
@@ -182,7 +179,7 @@ def _stepping(
 # harm, so the whole batch takes one branch.
 @jax.custom_batching.custom_vmap
 def _in_any(condition: Bool[Array, ""]) -> Bool[Array, ""]:
-    """Return the condition; in a batch, whether it holds for any problem."""
+    """Return the condition or, under `vmap`, whether the condition holds for any problem of the batch."""
     return condition
 
 
@@ -196,7 +193,7 @@ def _ritz_pairs(state: _Recurrence, offset: int, steps: int | Int[Array, ""], wa
     room, _, b, _ = state.matrix.shape
     i = jnp.arange(room)
     diagonal, below = state.matrix[:, 0], state.matrix[:-1, 1]
-    # The last coupling belongs to a block outside the basis.
+    # The coupling matrix after the last step belongs to a block outside the basis, so it is set to zero.
     below = jnp.where((i[:-1] < steps - 1)[:, None, None], below, 0)
     full = jnp.zeros((room, b, room, b), below.dtype).at[i, :, i, :].set(diagonal)
     full = full.at[i[:-1], :, i[1:], :].set(below)

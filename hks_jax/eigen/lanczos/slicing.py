@@ -25,7 +25,7 @@ from hks_jax.linear.products import gram, matmul, products_with_columns
 from hks_jax.traced import is_traced
 
 _ERROR = 0.1
-"""The largest error of solves, relative to the allowed residual of the lowest missing eigenvalue."""
+"""The largest accepted error of solves, relative to the allowed residual of the lowest missing eigenvalue."""
 _EXCUSE = 30
 """The factor by which residuals may exceed the usual level of rounding if nothing converges otherwise."""
 _MOVES = 3
@@ -33,7 +33,7 @@ _MOVES = 3
 _TURNS = 12
 """The maximal number of inverse iterations in a search."""
 _COPY = 1e-6
-"""A relative distance that exceeds the differences of the computed values of a multiple eigenvalue."""
+"""The relative distance within which all computed copies of a multiple eigenvalue lie."""
 
 Scalar = Float[Array, ""]
 Interval = tuple[Scalar, Scalar]
@@ -44,7 +44,7 @@ Order = Int[Array, " ritz"]
 def cut(
     problem: Problem, dissection: Dissection, plan: Plan, state: SlicingState, vectors: Stored
 ) -> tuple[Factorisation, Bool[Array, ""], tuple[SlicingState, Stored]]:
-    """Factorise at the state's shift; also return whether to search there, and the state with room for the results."""
+    """Factorise K − σM at the next shift σ; also return whether to search around σ, and the state with free storage."""
     factor = factorise(dissection, problem.pencil.shifted(state.shift))
     trial = try_out(factor, problem.pencil, state.shift, state.noise)
     searchable, full, following = _consider(problem, factor.negative, trial, plan, state)
@@ -60,25 +60,26 @@ def _consider(
     missing = below - known
     complete = trial.sound & (missing == 0)
     last = jnp.sort(state.values)[plan.wanted - 1]
-    all_wanted = (known >= plan.wanted) | (last * (1 - 2 * _COPY) < state.shift)  # or just below the last multiplet
-    finished = complete & (all_wanted | (negative == problem.pencil.size))  # or no further eigenvalues exist
-    # If equally many eigenvalues are missing at a lower shift, the missing eigenvalues are equal. Then search at this
-    # shift, repeatedly if necessary.
+    # The search ends if all wanted pairs are known, or all but copies of the last one, or if no further pairs exist.
+    all_wanted = (known >= plan.wanted) | (last * (1 - 2 * _COPY) < state.shift)
+    finished = complete & (all_wanted | (negative == problem.pencil.size))
+    # If lowering the shift leaves equally many eigenvalues missing, the missing ones are copies of a multiple
+    # eigenvalue. The search for these copies is at the lowered shift, repeatedly if necessary.
     too_many = trial.sound & (missing > plan.slice_size) & (below != state.below)
     multiple = trial.sound & (missing > 2 * plan.block) & (below == state.far_below)
-    # If a multiplicity exceeds the wanted number, some pairs suffice. Then the certificate ends below the multiplet.
+    # If an eigenvalue has more copies than pairs are wanted, some suffice, and the certificate ends just below it.
     cut = multiple & jnp.isfinite(last)
     lowest = jnp.where(state.reached > 0, state.reached, problem.lowest)
     accurate = state.stuck | (trial.error <= _ERROR * _needed(problem, plan, lowest))
-    # A new shift takes one factorisation; refined solves take more time. So refine only if a new shift is no better.
+    # Moving the shift takes less time than refining all solves, so solves are refined only if a move does not help.
     moves = ~(finished | too_many) & jnp.where(trial.sound, ~accurate & (state.moved < 1), state.moved < _MOVES)
 
-    # Very many eigenvalues may follow a wide gap. Then divide the range between the known eigenvalues and the shift.
+    # If too many eigenvalues are missing, the new shift divides the range between the known ones and the old shift.
     start = jnp.maximum(state.reached, state.complete_below)
     share = jnp.maximum(plan.slice_size / (2.5 * jnp.maximum(missing, 1).astype(state.shift.dtype)), 1 / 4)
     nearer = start + share * (state.shift - start)
     # Inertia may be uncertain if the shift is an eigenvalue of a part of the domain; a move by 0.7 mean gaps avoids
-    # this. The shift moves up if all eigenvalues below it are known, and otherwise down.
+    # this eigenvalue. The shift moves up if all eigenvalues below it are known, and otherwise down.
     down = state.shift - 0.7 * (state.shift - state.reached) / jnp.maximum(missing, 1).astype(state.shift.dtype)
     up = state.shift + 0.7 * _spacing(problem, plan, state)
     beside = jnp.where(jnp.where(trial.sound, missing <= 0, state.known >= plan.wanted), up, down)
@@ -112,8 +113,8 @@ def search(
     shifted = ShiftedSolve(factor, state.shift, state.passes)
     one_multiplet = not is_traced(state.multiple) and bool(state.multiple)
     if not one_multiplet:
-        # If one slice suffices, usually no vector is known, and the window is empty. With several slices, an empty
-        # first window would need a separate compilation.
+        # The search stays orthogonal to a window of known eigenvectors. If one slice suffices, the window is empty.
+        # With several slices, zero vectors fill the first window, because an empty window would be compiled separately.
         nothing = plan.wanted <= plan.slice_size and not is_traced(state.known) and int(state.known) == 0
         known, interval, steps = _window(problem, plan, state, vectors, 0 if nothing else plan.window)
         ritz = block_lanczos(problem.pencil, shifted, state.start, known, plan.steps, steps, plan.ritz)
@@ -121,13 +122,13 @@ def search(
         one_multiplet = not is_traced(following.stuck) and bool(following.stuck and state.below > 0)
     if one_multiplet:
         order, new, following = _nearest(problem, shifted, plan, state, vectors)
-    # This is a separate call, so that only two arrays of vectors are in memory at a time.
+    # New vectors are stored in a separate call, so that only two arrays of vectors are in memory at a time.
     return following, _stored(vectors, new, order, state.known)
 
 
-# Block Lanczos finds at most as many pairs of a multiple eigenvalue as a block has columns. It fails if the number of
-# steps exceeds the number of distinct eigenvalues. Inverse iteration finds as many pairs near the shift as it has
-# vectors. If a multiplicity is larger, any vectors of the eigenspace suffice.
+# Block Lanczos finds at most as many pairs of a multiple eigenvalue as a block has columns, and breaks down if it takes
+# more steps than there are distinct eigenvalues. Inverse iteration with m vectors finds m pairs near the shift. If the
+# multiplicity of an eigenvalue exceeds m, any m vectors of its eigenspace suffice.
 def _nearest(
     problem: Problem, shifted: ShiftedSolve, plan: Plan, state: SlicingState, vectors: Stored
 ) -> tuple[Order, Float[Array, "ritz n_dof"], SlicingState]:
@@ -151,7 +152,6 @@ def _nearest(
 def _inverse_iteration(
     pencil: SymmetricPencil, shifted: ShiftedSolve, vectors: Stored, known: Int[Array, ""], x: Block
 ) -> tuple[Float[Array, " b"], Block, Float[Array, " b"]]:
-    """Return Ritz values, M-orthonormal Ritz vectors orthogonal to the known vectors, and residuals."""
     stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
     x = shifted.factor.solve(mass(x))
     for _ in range(2):
@@ -167,10 +167,10 @@ def _inverse_iteration(
 def _window(
     problem: Problem, plan: Plan, state: SlicingState, vectors: Stored, rows: int
 ) -> tuple[Float[Array, "rows n_dof"], Interval, Int[Array, ""]]:
-    """Return the data of a search around the state's shift.
+    """Return the known eigenvectors, the interval and the number of Lanczos blocks for a search around the shift.
 
-    The data are the known eigenvectors nearest to the shift, padded with zeros, to which the search stays orthogonal;
-    the interval that contains no other known eigenvalue; and the number of Lanczos blocks.
+    The search stays orthogonal to the known eigenvectors nearest to the shift, which are padded with zeros. The
+    interval around the shift contains the eigenvalues of no other known eigenvectors.
     """
     nearest = jnp.argsort(jnp.abs(state.values - state.shift))[:rows]
     vectors = jnp.where((nearest < state.known)[:, None], vectors[nearest], 0)
@@ -186,7 +186,6 @@ def _window(
 
 @jit_quickly(donate_argnames="known_vectors")
 def _stored(known_vectors: Stored, vectors: Float[Array, "ritz n_dof"], order: Order, known: Int[Array, ""]) -> Stored:
-    """Append ``vectors[order]`` to the known vectors, in place."""
     return jax.lax.dynamic_update_slice_in_dim(known_vectors, vectors[order], known, 0)
 
 
@@ -205,7 +204,7 @@ def _accept(
     values, residuals, _ = measure_pairs(problem.pencil, vectors)
     first_nonzero = jnp.sort(jnp.concatenate([state.values, values]))[plan.nulls]
     scale = jnp.maximum(jnp.abs(values), jnp.maximum(first_nonzero, problem.unit))
-    # If no pair converged, as on a very elongated domain, rounding exceeds the usual level; then the limit is raised.
+    # If the last search found no pair, as on a very elongated domain, larger rounding errors are accepted.
     excuse = jnp.where(state.stuck, _EXCUSE, 1).astype(dtype)
     allowed = allowed_residuals(scale, excuse * indistinct(problem.pencil, dtype), plan.tolerance)
     converged = (residuals <= allowed) & (theta != 0)
@@ -230,17 +229,17 @@ def _accept(
     # All eigenvalues between the shift and `end` are known.
     gapless = jnp.max(jnp.where((index < known) & (all_values < end), all_values, -jnp.inf), initial=0)
 
-    # If eigenvalues below the shift are missing, move towards the lowest Ritz value that did not converge. If all these
-    # Ritz values converged, a multiplet was found only in part, and its eigenvalue is unknown. If not even the lowest
-    # pairs converge, move below the spectrum, where the matrix is definite and its factorisation most accurate.
+    # If eigenvalues below the shift are missing, move towards the lowest Ritz value that did not converge. If all Ritz
+    # values below the shift converged, copies of some multiple eigenvalue are missing; move towards `complete_below`.
+    # If not even the lowest pairs converge, move below the spectrum, where K − σM is definite and its factorisation
+    # most accurate.
     lowest = jnp.min(jnp.where(~converged & (values > low) & (values < shift), values, shift))
     seen, stuck = lowest < shift, ~complete & (count == 0)
     again = jnp.where(seen, lowest + (shift - lowest) / 4, (state.complete_below + shift) / 2)
     bottom = (state.reached <= 0) & (problem.negative == 0)
     again = jnp.where(stuck & bottom, -jnp.abs(shift) / jnp.maximum(state.below, 1).astype(dtype), again)
     leftover = jnp.argsort(jnp.where(above & ~accepted, near, jnp.inf))[: plan.block]
-    # If all eigenvalues below the shift are known and none converged above it, as above an isolated multiplet, move to
-    # the next Ritz values.
+    # If no pair converged, and none is missing below the shift, a wide gap follows; move to the next Ritz values.
     beyond = jnp.sort(jnp.where(above, near, jnp.inf))[min(plan.slice_size // 4, plan.ritz - 1)]
     onward = jnp.where((count == 0) & jnp.isfinite(beyond), shift + 1.1 * (beyond - shift), -jnp.inf)
     noise = 0.01 * jnp.std(vectors) * jnp.roll(state.noise, state.slices, axis=0)
@@ -263,7 +262,7 @@ def _accept(
 
 
 def _spacing(problem: Problem, plan: Plan, state: SlicingState) -> Scalar:
-    """Return the mean gap of the last known eigenvalues; if few are known, at least the expected gap."""
+    """Return the mean gap of the last known eigenvalues; if few are known, at least the ``spacing`` of the problem."""
     few = jnp.minimum(state.known, plan.slice_size)
     ordered = jnp.sort(state.values)
     last = ordered[jnp.maximum(state.known - 1, 0)]

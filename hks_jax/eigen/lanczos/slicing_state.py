@@ -1,4 +1,4 @@
-"""The state of spectrum slicing between two slices, and the sizes of its computation."""
+"""The problem, the static settings and the changing state of spectrum slicing."""
 
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ from hks_jax.linear.loops import by_column_ranges
 from hks_jax.linear.pencil import SymmetricPencil
 
 _NODES = 1 << 16
-"""The number of degrees of freedom at which eigenvectors are permuted together."""
+"""The number of degrees of freedom for which the stored eigenvectors are reordered at once."""
 
 Stored = Float[Array, "capacity n_dof"]
 
@@ -23,12 +23,12 @@ class Problem(NamedTuple):
     first: Float[Array, ""]  # the first shift
     spacing: Float[Array, ""]  # the expected mean gap of eigenvalues
     lowest: Float[Array, ""]  # the expected lowest nonzero eigenvalue
-    unit: Float[Array, ""]  # the least scale of relative residuals
+    unit: Float[Array, ""]  # the least number by which residuals are divided in relative residuals
     negative: Int[Array, ""]  # the number of negative eigenvalues, which are not wanted
 
 
 class Plan(NamedTuple):
-    """The sizes of a computation; static."""
+    """The static settings of spectrum slicing."""
 
     wanted: int  # the number of eigenpairs
     block: int  # the number of vectors per Lanczos block
@@ -67,14 +67,14 @@ class Plan(NamedTuple):
 
 
 class SlicingState(NamedTuple):
-    """The state between two slices, without the vectors. A pair is called known if it was computed and accepted."""
+    """The state of spectrum slicing, except eigenvectors. A pair is called known if it was computed and accepted."""
 
     values: Float[Array, " capacity"]  # known eigenvalues in the order of acceptance, padded with infinity
     known: Int[Array, ""]  # the number of known pairs
     shift: Float[Array, ""]  # the next shift
     # the number of eigenvalues between zero and the shift, by inertia; −1 if the factorisation was too inaccurate
     below: Int[Array, ""]
-    multiple: Bool[Array, ""]  # whether many eigenvalues are missing that are probably equal
+    multiple: Bool[Array, ""]  # whether many copies of one multiple eigenvalue are probably missing
     far: Float[Array, ""]  # the last shift at which too many eigenvalues were missing for a search
     far_below: Int[Array, ""]  # the number of eigenvalues below `far`; 0 at first
     reached: Float[Array, ""]  # the end of the range from zero in which no eigenvalue seems to be missing

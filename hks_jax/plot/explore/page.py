@@ -29,7 +29,7 @@ SCRIPTS = ("data", "colours", "image", "mesh", "curves", "regions", "controls", 
 """The page's scripts in the order of their dependencies."""
 COLOURS = {"sequential": "viridis", "diverging": "RdBu_r", "distance": "inferno_r", "grey": "gray"}
 LIMIT = 256 * 1024**2
-"""The maximum bytes of numbers in a page. Numbers as text are a third longer, and browsers limit a text to 512 MiB."""
+"""The maximum bytes of numbers in a page. Base64 makes numbers a third longer, and browsers limit texts to 512 MiB."""
 
 
 def explore(
@@ -44,23 +44,22 @@ def explore(
 ) -> Path:
     """Write an HTML page to explore a signature on a grid or a surface in any browser, without a network.
 
-    The page shows the signature with sliders for t and, for a volume, the slice, and maps of the tensors beside it. A
-    click or the arrow keys choose a point, whose signature is drawn over t. All other points are coloured by the
-    distance between their curves and the curve of this point (Sun, Ovsjanikov and Guibas 2009): the root mean square
-    over log t of the difference of the two signatures, each relative to the mean over the domain. Two points can be
-    compared. A lasso, a maximum distance or a label defines a region, whose mean curve and spread are drawn. Curves can
-    be saved as CSV.
+    The page shows the signature with sliders for t and, for a volume, the slice, and maps of the tensors. A click or
+    the arrow keys choose a point, whose signature is drawn over t. Points are coloured by the distance of their
+    signature from the signature of the chosen point (Sun, Ovsjanikov and Guibas 2009): the root mean square over log t
+    of their difference, divided by the domain's mean at each t. Two points can be compared. A lasso, a maximum distance
+    or a label defines a region, whose mean curve and spread are drawn. Curves can be saved as CSV.
 
     The file contains the numbers in single precision, with 5⅓ bytes for each inside node at each time and in each map.
 
     Args:
         result: the signature at increasing times. Nodes without finite values at all times are omitted; on a surface,
             all values must be finite. The normalisations ``"raw"`` and ``"flat"`` are shown as (4πt)^(d/2)·HKS, which
-            is 1 for flat space without boundary, with colours that diverge from 1. With the standard deviations
-            ``arrays["deviation"]``, curves of points have a band, and values fade if noise explains their difference
-            from flat space or from the mean. Tensors, if known, appear as mean eigenvalue, anisotropy and direction
-            (red, green and blue for x, y and z). With an affine, positions are shown in space, and the sides of images
-            have the letters L and R, P and A, I and S. For the metric D⁻¹, the distance √(Dt) is shown beside t.
+            is 1 for flat space without boundary, with colours that diverge from 1. If ``arrays["deviation"]`` is given,
+            curves have error bands, and values fade if noise explains their difference from flat space, the mean or the
+            median. Tensors, if given, appear as mean eigenvalue, anisotropy and direction (red, green and blue for x, y
+            and z). With an affine, positions are shown in space, and the sides of images have the letters L and R, P
+            and A, I and S. For the metric D⁻¹, the diffusion length √(Dt) is shown beside t.
         path: the file of the page; its folder is created.
         maps: additional maps (*shape) by name.
         labels: (*shape) integers that define regions, 0 for none.
@@ -178,7 +177,7 @@ def _tensor_layers(tensors: Real[ArrayLike, "*shape d d"], inside: Bool[np.ndarr
     values, vectors = np.linalg.eigh((array + array.swapaxes(-1, -2)) / 2)
     mean = values.mean(axis=-1)
     spread = np.sqrt(np.sum(np.square(values - mean[:, None]), axis=-1))
-    # Both kinds of anisotropy are 0 for multiples of the identity, and 1 if only one eigenvalue is nonzero.
+    # The anisotropies in 2D and 3D are 0 for multiples of the identity, and 1 if only one eigenvalue is nonzero.
     size = np.abs(values.sum(axis=-1)) / np.sqrt(2) if d == 2 else np.sqrt(np.sum(values**2, axis=-1) / 1.5)
     anisotropy = spread / np.where(size > 0, size, 1)
     largest = np.argmax(np.abs(values), axis=-1)
@@ -194,7 +193,6 @@ def _tensor_layers(tensors: Real[ArrayLike, "*shape d d"], inside: Bool[np.ndarr
 def _regions(
     labels: Real[ArrayLike, "*shape"], names: Mapping[int, str] | None, inside: Bool[np.ndarray, "*shape"]
 ) -> tuple[str, dict[int, str]]:
-    """Return the labels inside in base64, and the name or, without names, the number of each label that occurs."""
     found = region_statistics(np.where(inside, 1.0, np.nan)[None], labels)
     present = found.labels[found.nodes > 0].tolist()
     known = {label: f"label {label}" for label in present} | dict(names or {})
@@ -202,7 +200,7 @@ def _regions(
 
 
 def _in_space(result: Result) -> dict[str, Any]:
-    """Return the matrix from indices to space and the letters of the grid's sides; both are None without an affine."""
+    """Return the matrix from indices to space coordinates, and the letters (L, R, …) of the grid's sides."""
     volume = result.place
     if not isinstance(volume, TensorVolume) or volume.affine is None:
         return {"world": None, "ends": None}
@@ -215,7 +213,6 @@ def _in_space(result: Result) -> dict[str, Any]:
 
 
 def _assemble(about: dict[str, Any], numbers: dict[str, str]) -> str:
-    """Return the page, whose scripts read the description and the numbers."""
     own = files(__package__)
     scripts = "\n".join((own / f"{name}.js").read_text(encoding="utf-8") for name in SCRIPTS)
     # "<" is escaped as JSON allows, so that no text can close its script element.
