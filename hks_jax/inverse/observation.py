@@ -187,7 +187,7 @@ def observe(target: Any, times: Any, data: Data, space: FunctionSpace, dtype: An
 def _weights(
     values: np.ndarray, given: np.ndarray, used: np.ndarray, data: Data
 ) -> tuple[Float[np.ndarray, " m"], float | None]:
-    """Return the observed values' weights divided by squared deviations, and the residuals' standard deviation or None."""
+    """Return the used weights divided by the squared deviations, and the residuals' standard deviation or None."""
     given, noise = given[used], data.noise
     if data.deviation is None:
         return given, noise
