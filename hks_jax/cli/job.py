@@ -134,7 +134,7 @@ def solve(pencil: hj.Pencil | hj.MirrorPencil, settings: Settings, progress: Pro
     unknowns, dimension = sum(part.space.n_dof for part in pencil.parts), pencil.space.dimension
     assert dimension is not None
     k = default_k(dimension, unknowns) if settings.k is None else settings.k
-    name = choose_solver(settings.solver, pencil.parts[0], k).name
+    name = choose_solver(settings.solver, pencil.parts[0], -(-k // len(pencil.parts))).name
     with progress.stage("eigenpairs", f"{k} of {unknowns} by {name}"):
         pairs = hj.eigenpairs(pencil, k, solver=settings.solver, progress=progress.update)
         jax.block_until_ready(pairs.eigenvalues)

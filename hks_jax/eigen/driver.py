@@ -171,7 +171,8 @@ def _lowest(
 ) -> Eigenpairs:
     total = sum(part.size for part in pencil.parts)
     size = min(k + SPARE, total) if multiplet == "complete" else k
-    solvers = [choose_solver(solver, part, size) for part in pencil.parts]
+    share = -(-size // len(pencil.parts))  # the problems of a doubled domain share the eigenpairs
+    solvers = [choose_solver(solver, part, share) for part in pencil.parts]
     extra = min(1, total - size)  # the next eigenvalue shows whether k cuts a multiple eigenvalue
     if isinstance(pencil, MirrorPencil):
         pairs = solve_doubled(pencil, solvers, size, extra, throw, report)

@@ -107,6 +107,13 @@ def test_what_auto_chooses_in_single_precision():
     assert choose_solver("auto", volume, 100).name == "chebyshev-filter"
 
 
+def test_the_problems_of_a_doubled_domain_share_the_pairs(monkeypatch):
+    field = hj.TensorField(hj.Grid((42, 41)), np.broadcast_to(np.diag([1.0, 2.0]), (42, 41, 2, 2)))
+    monkeypatch.setattr(automatic, "_LARGE", 30 * field.grid.size)
+    assert hj.eigenpairs(field, 40, "mean").solver_name == "shift-invert"
+    assert choose_solver("auto", hj.assemble(field), 40).name == "block-lanczos"
+
+
 def test_on_accelerators_nothing_runs_on_the_host(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     plane = hj.assemble(flat((42, 41), (1.0, 1.0)))
