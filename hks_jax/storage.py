@@ -47,10 +47,10 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: str | os.PathLike[str], stale: Callable[[], Iterable[Path]] = tuple) -> Iterator[Path]:
-    """Yield a temporary folder beside `path`; move the files written there into `path` at the end.
+    """Yield a temporary folder in `path`; move the files written there into `path` at the end.
 
     Each moved file atomically replaces a file of the same name in `path`; other files remain. If the body raises, the
-    temporary folder is removed, and `path` is neither changed nor created.
+    temporary folder is removed, and so is `path` if it did not exist before.
 
     Args:
         path: the folder.
@@ -70,13 +70,12 @@ def atomic_folder(path: str | os.PathLike[str], stale: Callable[[], Iterable[Pat
     if target.exists() and not target.is_dir():
         raise NotADirectoryError(f"{target}: got a file; expected a folder or an unused name")
     absent = [folder for folder in (target, *target.parents) if not folder.exists()]
-    target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(f".{uuid.uuid4().hex[:12]}.{target.name}")
+    # The temporary folder is in the target, because the target's parent may be on another drive or not writable.
+    temporary = target / f".{uuid.uuid4().hex[:12]}.unfinished"
     done = False
     try:
-        temporary.mkdir()
+        temporary.mkdir(parents=True)
         yield temporary
-        target.mkdir(exist_ok=True)
         for file in stale():
             file.unlink(missing_ok=True)
         for file in sorted(temporary.iterdir()):

@@ -12,6 +12,7 @@ examples:
 
 import _thread
 import argparse
+import io
 import os
 import sys
 import threading
@@ -101,6 +102,8 @@ def run_and_exit() -> NoReturn:
     JAX's threads continue after an interrupt, and Python would crash while stopping them, so the process ends at once.
     """
     sys.unraisablehook = _interrupt_again
+    if isinstance(sys.stdout, io.TextIOWrapper):  # its encoding, such as Windows' for files, may lack λ or …
+        sys.stdout.reconfigure(errors="backslashreplace")
     code = main()
     if code == INTERRUPTED:
         sys.stdout.flush()

@@ -60,7 +60,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     times = (min(volume.spacing) * SPREADS) ** 2 / median_mean_diffusivity(volume)
     chosen: dict[str, Any] = {"metric": "inverse", "components": "largest", "k": N_PAIRS, "normalisation": "flat"}
     settings = Settings.of(**chosen, times=Times(tuple(times.tolist()), 0))
-    result = signature_of(args, compute_pairs(volume, settings, progress), progress)
+    result = signature_of(args, compute_pairs(volume, settings, progress), None, progress)
     title = (
         rf"$4\pi t\,$HKS of {'a phantom' if brain is None else 'a brain slice'}, metric D⁻¹. The value 1 means flat; "
         "larger values mean positive curvature of the metric or the boundary"

@@ -29,15 +29,15 @@ from hks_jax.fem.boundary import unreached_sides
 from hks_jax.io import read_tensors, save, save_tensors
 from hks_jax.io.formats import format_of
 from hks_jax.io.result import Result, plain, tuples
-from hks_jax.io.volume import digest
+from hks_jax.io.volume import TensorVolume, digest, require_position
 
 OPTIONS = f"""
-target TARGET  the signature, an .npz file
+target TARGET  the signature, an .npz file or the folder of a signature
 @output
 --init FILE  the initial tensors: {FORMATS} (default: identity)
 --metric tensor|inverse|adjugate
     the metric of the tensors D in --init: inverse is D⁻¹, tensor is D itself, adjugate is |D|D⁻¹. This option is
-    required except for NumPy's files, whose tensors are the metric by default
+    required except for NumPy's files without a unit of length, whose tensors are the metric by default
 --order ORDER  order of the components in --init, if the file does not declare it
 @interpolation
 --parametrisation log-euclidean|cholesky|conformal|eigenvalues|rotation = log-euclidean
@@ -62,6 +62,7 @@ target TARGET  the signature, an .npz file
 """
 
 
+_NO_METRIC = "--metric: choose inverse, tensor or adjugate, because --init has diffusion tensors and not a metric"
 _OF_SEARCH = ("optimiser", "smoothness", "max_steps", "continuation", "starts", "seed")
 """Options that are arguments of `Search` with the same name."""
 
@@ -71,9 +72,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     if args.init is None:
         refuse(args, ("metric", "order"), "this option describes the tensors in --init, which is missing; pass both")
     elif args.metric is None and format_of(args.init).image:
-        raise ValueError(
-            "--metric: choose inverse, tensor or adjugate, because --init has diffusion tensors and not a metric"
-        )
+        raise ValueError(_NO_METRIC)
     from hks_jax import fit_metric
     from hks_jax.inverse import H1, Data, Search, TotalVariation
     from hks_jax.inverse.metric_fit import RESULTS
@@ -81,9 +80,14 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     use_dtype(args.dtype)
     with progress.stage("reading", str(args.target)):
         target = Result.read(args.target, "hks", over_times=True)
+        if target.normalisation != "raw":
+            raise ValueError(
+                f"TARGET: got {target.source} with the normalisation {target.normalisation}; expected raw. Compute "
+                "it by 'hks-jax hks' without --normalisation"
+            )
         # The mask is the domain of the computed signature, so all of its components belong to the domain.
         grid = target.grid
-        init = _initial(args, grid, progress)
+        init = _initial(args, target.volume, grid, progress)
         if args.boundary is None:
             recorded = tuples(target.settings.get("boundary"))
             args.boundary = recorded or "neumann"
@@ -113,7 +117,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     names = ("init", "metric", "interpolation", "h1", "tv", "dtype", "checkpoint", "noise", "boundary", *_OF_SEARCH)
     report = {
         "target": {
-            "source": str(args.target),
+            "source": target.source,
             "shape": grid.shape,
             "spacing": grid.spacing,
             "nodes_inside": int(grid.inside.sum()),
@@ -129,11 +133,13 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     return _write(args, fit, target, report, progress)
 
 
-def _initial(args: argparse.Namespace, grid: Grid, progress: Progress) -> TensorField:
+def _initial(args: argparse.Namespace, target: TensorVolume, grid: Grid, progress: Progress) -> TensorField:
     if args.init is None:
         unit = np.eye(grid.dimension, dtype=args.dtype)
         return TensorField(grid, np.broadcast_to(unit, (*grid.shape, *unit.shape)), args.interpolation)
     volume = read_tensors(args.init, args.order)
+    if args.metric is None and volume.length_unit:  # of NumPy's files, as in `require_metric`
+        raise ValueError(_NO_METRIC)
     if volume.shape != grid.shape:
         remedy = "Give one tensor for each node of the target"
         if volume.dimension > grid.dimension:
@@ -141,6 +147,7 @@ def _initial(args: argparse.Namespace, grid: Grid, progress: Progress) -> Tensor
         raise ValueError(
             f"--init: got tensors of shape {volume.shape}; expected the target's shape {grid.shape}. {remedy}"
         )
+    require_position("--init", volume.affine, target.affine, target.volume_shape, of="the target")
     if not np.allclose(volume.spacing, grid.spacing, rtol=1e-4):
         progress.warn(f"--init: got the spacing {volume.spacing}; using the spacing of the target, {grid.spacing}")
     if lacking := int((grid.inside & ~volume.inside).sum()):
@@ -158,12 +165,13 @@ def _write(args: argparse.Namespace, fit: Any, target: Result, report: dict[str,
     from hks_jax.plot.signature import placed
 
     volume = replace(target.volume, tensors=np.asarray(fit.field.domain_tensors), order="matrix", frame="voxel")
-    volume = replace(volume, source=str(args.target), digest=digest(args.target), notes=())
+    volume = replace(volume, source=target.source, digest=digest(target.source), notes=(), unit="")
     history = {"losses": "loss", "misfits": "misfit", "stages": "stage", "starts": "start"}
     columns = {name: np.array([getattr(step, of) for step in fit.history]) for name, of in history.items()}
     with writing(args.output, report, progress, lambda: [args.output / "fit.png"]) as (folder, done):
         origin, extra = {"command": sys.argv, "settings": report["settings"]}, {"times": target.times, **columns}
-        save_tensors(folder / "tensors.npz", volume, provenance=origin)
+        metric = replace(volume, length_unit="")  # otherwise, the tensors count as diffusion tensors when they are read
+        save_tensors(folder / "tensors.npz", metric, provenance=origin)
         save(folder / "fit.npz", np.asarray(fit.hks), volume, name="hks", extra=extra, provenance=origin)
         if volume.dimension == 2:
             figure = fit_panels(fit, target.values, target.times, orientation=placed(volume, None, args.view))

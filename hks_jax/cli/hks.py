@@ -34,7 +34,7 @@ from hks_jax import SurfaceMesh, TensorNoise, TetMesh, assemble
 from hks_jax.cli import pairs as saved_pairs
 from hks_jax.cli.info import describe_mesh
 from hks_jax.cli.job import Settings, compute_pairs, result_of, solve, use_dtype
-from hks_jax.cli.noise import Noisy, noise_of_volume, require_spectral, signature_of, with_error_bars
+from hks_jax.cli.noise import Noisy, check_noise, noise_of_volume, signature_of, with_error_bars
 from hks_jax.cli.options import READING, SOLVING, options_in, refuse
 from hks_jax.cli.outputs import PAIRS, Done, of_earlier, write_outputs
 from hks_jax.cli.progress import Progress
@@ -72,11 +72,11 @@ _NO_NOISE = "this option needs tensors; saved eigenpairs and meshes with the Euc
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
+    check_noise(args)
     if is_mesh(args.file):
         return _on_mesh(args, Settings.of(args, metric=args.metric), progress)
     refuse(args, ("clean", "inside"), "this option is for meshes; for tensors on a grid, see --repair and --mask")
     refuse(args, ("tensors",), "this option is for a mesh inside a volume; leave it out for the volume itself")
-    require_spectral(args)
     if saved := not args.others and saved_pairs.is_saved_pairs(args.file):
         refuse(args, ("noise",), _NO_NOISE)
         settled = [option.name for option in options_in(f"@metric {READING} {SOLVING}")]
@@ -94,14 +94,17 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         volume, image = read_volume(args, progress), format_of(args.file).image
     if volume.dimension == 2:
         refuse(args, ("through",), "this option is for a volume; leave it out for a slice")
+    noise = None
     if not saved:
+        use_dtype(args.dtype)
+        noise = noise_of_volume(args, volume, volume.grid(args.components), progress)  # may fail, so it comes first
         solved = compute_pairs(volume, settings, progress)
     if args.save_pairs:  # the eigenpairs are written first, because later steps may fail
         with progress.stage("writing", str(args.output / PAIRS)):
             for file in of_earlier(args.output, np.asarray(solved.pairs.eigenvalues), progress):
                 file.unlink(missing_ok=True)
             saved_pairs.write_pairs(args.output / PAIRS, solved, image, progress.warnings)
-    result = signature_of(args, solved, progress)
+    result = signature_of(args, solved, noise, progress)
     drawing = partial(signature_panels, result, view=args.view, through=args.through)
     done = write_outputs(args.output, result, progress, drawing, image)
     return done._replace(files=[*done.files, *[args.output / PAIRS] * args.save_pairs])
@@ -130,6 +133,8 @@ def _on_mesh(args: argparse.Namespace, settings: Settings, progress: Progress) -
 
 def _check_mesh_options(args: argparse.Namespace) -> None:
     """Raise ValueError for options that only grids have, and for tensors without --metric."""
+    if args.others:
+        raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one mesh")
     if args.tensors and args.array:
         raise ValueError("--tensors, --array: got both; expected tensors either in a volume or at the mesh's vertices")
     of_grids = ["slice", "through", "view", "save_pairs", "components", "method"]
@@ -156,6 +161,11 @@ def _read_domain(args: argparse.Namespace, progress: Progress) -> tuple[SurfaceM
     vertices, cells = np.asarray(mesh.vertices).astype(args.dtype), mesh.triangulation.cells
     kind: Any = type(mesh)
     inside = None if args.inside is None else _inside(args.inside, len(vertices))
+    if inside is not None:
+        try:
+            kind(vertices, cells, mask=inside)
+        except ValueError as error:
+            raise ValueError(f"--inside: {str(error).removeprefix('mask: ')}") from error
     settings: Any = {"at": "vertices", "interpolation": args.interpolation, "mask": inside}
 
     def domain(tensors: Any) -> SurfaceMesh | TetMesh:
@@ -171,10 +181,9 @@ def _read_domain(args: argparse.Namespace, progress: Progress) -> tuple[SurfaceM
             tensors[at] = sample_tensors(replace(volume, tensors=np.asarray(values)), np.asarray(mesh.vertices)[at])
             return domain(tensors)
 
-        if args.noise is None:
-            return sampled(volume.tensors), None
         noise = noise_of_volume(args, volume, volume.grid("all"), progress)
-        return sampled(volume.tensors), Noisy(volume.tensors, noise, sampled, traceable=False)
+        noisy = None if noise is None else Noisy(volume.tensors, noise, sampled, traceable=False)
+        return sampled(volume.tensors), noisy
     if not args.array:
         return kind(vertices, cells, mask=inside), None
     arrays = read_mesh_arrays(args.file, clean=args.clean)
@@ -202,7 +211,7 @@ def _inside(path: Path, n_vertices: int) -> Bool[np.ndarray, " V"]:
     if path.suffix != ".label":
         return read_mask(path)
     numbers = optional("nibabel.freesurfer").read_label(path)
-    if numbers.size == 0 or numbers.max() >= n_vertices:
+    if numbers.size == 0 or numbers.min() < 0 or numbers.max() >= n_vertices:
         raise ValueError(f"--inside: got {numbers.size} vertices in {path}; expected indices 0 … {n_vertices - 1}")
     return np.isin(np.arange(n_vertices), numbers)
 
@@ -215,13 +224,15 @@ def _draw_mesh(result: Result, path: Path) -> None:
 
     mesh = result.place
     assert isinstance(mesh, SurfaceMesh | TetMesh)
+    cells = mesh.triangulation
+    visible = cells.boundary_vertices if isinstance(mesh, TetMesh) else cells.used
     columns = min(len(result.times), 4)
     rows = math.ceil(len(result.times) / columns)
     figure = new_figure(3.4 * columns, 3.0 * rows + 0.3)
     figure.suptitle(caption(result))
     for i, (time, values) in enumerate(zip(result.times, result.values, strict=True)):
         ax = figure.add_subplot(rows, columns, i + 1, projection="3d")
-        ((low, high, _),) = colours_of([values], least_range=LEAST_RANGE)
+        ((low, high, _),) = colours_of([values[visible]], least_range=LEAST_RANGE)
         figure.colorbar(surface(ax, mesh, values, vmin=low, vmax=high), ax=ax, shrink=0.6)
         ax.set_title(f"$t$ = {number_text(float(time))}", fontsize="medium")
     save_figure(figure, path)

@@ -14,6 +14,7 @@ examples:
 import argparse
 import json
 import math
+import shlex
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,10 @@ OPTIONS = f"@file {READING} @clean"
 def run(args: argparse.Namespace, progress: Progress) -> None:
     """Run the command."""
     progress.quiet, questions = True, list[str]()
-    if (result := _result_of(args.file)) is not None:
+    result = _result_of(args.file)
+    if args.others and (result is not None or is_mesh(args.file)):
+        raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one result or mesh")
+    if result is not None:
         description = _describe_result(result)
     elif is_mesh(args.file):
         description = {"file": str(args.file), **describe_mesh(args.file, read_mesh(args.file, clean=args.clean))}
@@ -58,6 +62,7 @@ def _result_of(path: Path) -> Result | None:
 
 
 def _describe_result(result: Result) -> dict[str, Any]:
+    source = shlex.quote(result.source)
     facts = {
         "file": result.source,
         "result": {"hks": "heat kernel signature", "curvature": "Gaussian curvature"}[result.name],
@@ -66,11 +71,11 @@ def _describe_result(result: Result) -> dict[str, Any]:
         **{name: value for name, value in result.settings.items() if value},
         "times": result.times.tolist(),
         "√(Dt)": [] if result.lengths is None else result.lengths.tolist(),
-        "to draw it": f"hks-jax plot {result.source} -o picture.png",
+        "to draw it": f"hks-jax plot {source} -o picture.png",
     }
     if result.name == "hks":
-        facts["to explore it"] = f"hks-jax explore {result.source}"
-        facts["for regions"] = f"hks-jax stats {result.source} --atlas LABELS"
+        facts["to explore it"] = f"hks-jax explore {source}"
+        facts["for regions"] = f"hks-jax stats {source} --atlas LABELS"
     return facts
 
 

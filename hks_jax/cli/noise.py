@@ -13,12 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 
 import hks_jax as hj
+from hks_jax.checks import require_count
 from hks_jax.cli.job import Settings, Solved, automatic_times, describe_input, result_of
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read_volume
 from hks_jax.cli.values import Times
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result
+from hks_jax.io.volume import require_position
+from hks_jax.uncertainty.propagate import LEAST
 
 _CANDIDATES = 4
 """The number of candidate times for each automatic time."""
@@ -41,10 +44,12 @@ class Noisy(NamedTuple):
     traceable: bool = True
 
 
-def require_spectral(args: argparse.Namespace) -> None:
-    """Raise ValueError if error bars are requested for a method other than ``"spectral"``."""
-    if args.noise is not None and args.method != "spectral":
-        raise ValueError(f"--noise: got --method {args.method}; expected spectral. Leave one of the options out")
+def check_noise(args: argparse.Namespace) -> None:
+    """Raise ValueError if error bars are requested for a method other than ``"spectral"``, or with too few draws."""
+    if args.noise is not None:
+        require_count("--draws", args.draws, LEAST)
+        if args.method != "spectral":
+            raise ValueError(f"--noise: got --method {args.method}; expected spectral. Leave one of the options out")
 
 
 def second_scan(args: argparse.Namespace) -> argparse.Namespace | None:
@@ -58,19 +63,18 @@ def second_scan(args: argparse.Namespace) -> argparse.Namespace | None:
         return argparse.Namespace(**{**vars(args), "file": Path(args.noise), "others": [], "noise": None})
 
 
-def signature_of(args: argparse.Namespace, solved: Solved, progress: Progress) -> Result:
-    """Compute the signature of a volume or slice from its eigenpairs, with error bars if ``--noise`` is given."""
+def signature_of(args: argparse.Namespace, solved: Solved, noise: hj.TensorNoise | None, progress: Progress) -> Result:
+    """Compute the signature of a volume or slice from its eigenpairs, with error bars unless `noise` is None."""
     volume, field, pairs, settings = solved
     of_pairs = partial(result_of, volume, describe_input(volume), pairs)
-    if getattr(args, "noise", None) is None:
+    if noise is None:
         return of_pairs(settings, progress)
 
     def metric(D: Any) -> Any:
         assert settings.metric is not None
         return hj.TensorField.from_diffusion(field.grid, D, settings.metric, interpolation=settings.interpolation)
 
-    noisy = Noisy(volume.tensors, noise_of_volume(args, volume, field.grid, progress), metric)
-    return with_error_bars(args, of_pairs, noisy, pairs, settings, progress)
+    return with_error_bars(args, of_pairs, Noisy(volume.tensors, noise, metric), pairs, settings, progress)
 
 
 def with_error_bars(
@@ -104,8 +108,10 @@ def with_error_bars(
 
 def noise_of_volume(
     args: argparse.Namespace, volume: TensorVolume, grid: hj.Grid, progress: Progress
-) -> hj.TensorNoise:
-    """Return the noise of a volume's tensors according to ``--noise``."""
+) -> hj.TensorNoise | None:
+    """Return the noise of a volume's tensors according to ``--noise``, or None without this option."""
+    if args.noise is None:
+        return None
     if args.noise == "residuals":
         if volume.covariance is None:
             raise ValueError("--noise: got residuals, which need a fit to diffusion-weighted images (--bval, --bvec)")
@@ -113,7 +119,14 @@ def noise_of_volume(
     if args.noise == "roughness":
         return hj.TensorNoise.from_roughness(volume.tensors, grid)
     if (second := second_scan(args)) is not None:
-        return hj.TensorNoise.from_scans(volume.tensors, read_volume(second, progress).tensors, grid)
+        other = read_volume(second, progress)
+        require_position(args.noise, other.affine, volume.affine, volume.volume_shape)
+        if other.shape == grid.shape and (lacking := int((grid.inside & ~other.inside).sum())):
+            raise ValueError(
+                f"--noise: got {args.noise} without tensors at {lacking} of the {int(grid.inside.sum())} voxels of the "
+                "domain; expected tensors of both scans. Pass --mask with the voxels that both scans cover"
+            )
+        return hj.TensorNoise.from_scans(volume.tensors, other.tensors, grid)
     return hj.TensorNoise.relative(volume.tensors, float(args.noise), grid)
 
 

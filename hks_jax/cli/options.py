@@ -31,8 +31,8 @@ file FILE...
     the metric that is made of the diffusion tensors D. inverse: D⁻¹, in which two points are near if water diffuses
     quickly between them, as along a fibre; t is then the time of diffusion, in s for D in mm2/s and voxels in mm. This
     is the usual choice for diffusion MRI. tensor: D itself, in which points are near if diffusion is slow. adjugate:
-    |D|D⁻¹, which is D⁻¹ times the determinant of D. The option is required except for NumPy's files, whose tensors are
-    the metric by default
+    |D|D⁻¹, which is D⁻¹ times the determinant of D. The option is required except for NumPy's files without a unit of
+    length, whose tensors are the metric by default
 [voxels] voxels
 --slice AXIS=N  one slice, such as z=14, instead of the volume
 --mask FILE  zeros and ones in NIfTI, MRtrix, NRRD, .npy, or in the array 'mask' of an .npz
@@ -251,6 +251,8 @@ def as_options(message: str, names: Iterable[str] = SPELLED) -> str:
         argument = rf"\b([Pp]ass|[Cc]hoose|or|try) {name}\b(?! [a-z])(?: \({flag(name)}\))?"
         message = re.sub(rf'{argument}(?: |=|: )"([\w/-]+)"', rf"\1 {flag(name)} \2", message)
         message = re.sub(argument, rf"\1 {flag(name)}", message)
+    for name, option in (("iterations", "--erode"), ("level", "--noise")):
+        message = re.sub(rf"^{name}: ", f"{option}: ", message)
     return message.replace("clean=True repairs some defects: see read_mesh", "--clean repairs some defects")
 
 

@@ -20,7 +20,7 @@ from hks_jax.storage import load_npz
 _RECORD = "field_record"
 _SETTLED = ("metric", "interpolation", "boundary", "components", "solver", "dtype")
 """Settings that the saved eigenpairs determine."""
-_ABOUT = ("order", "frame", "source", "digest", "length_unit", "unit", "notes", "repair")
+_ABOUT = ("order", "frame", "source", "digest", "notes", "repair")
 """The attributes of a volume that are saved as text."""
 
 

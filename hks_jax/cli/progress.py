@@ -46,7 +46,7 @@ class Progress:
 
     def __init__(self, quiet: bool = False, stream: TextIO | io.StringIO | None = None) -> None:
         self.quiet = quiet
-        self.stream = sys.stderr if stream is None else stream
+        self.stream = stream or sys.stderr or io.StringIO()  # stderr is None if it is closed
         self.timings: dict[str, float] = {}
         self.warnings: list[str] = []
         self.start = self._last = self._begin = time.perf_counter()

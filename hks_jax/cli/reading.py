@@ -16,9 +16,12 @@ from hks_jax.io.repair import find_background, require_valid, without_background
 from hks_jax.io.units import unit_question
 
 
-def require_metric(args: argparse.Namespace) -> None:
-    """Raise ValueError if the file has diffusion tensors and no metric is chosen."""
-    if args.metric is None and format_of(args.file).image:
+def require_metric(args: argparse.Namespace, volume: TensorVolume | None = None) -> None:
+    """Raise ValueError if the file has diffusion tensors and no metric is chosen.
+
+    Of NumPy's files, only those with lengths in mm have diffusion tensors, which `volume` shows after the file is read.
+    """
+    if args.metric is None and (format_of(args.file).image if volume is None else volume.length_unit):
         raise ValueError(
             "--metric: choose the metric of the diffusion tensors D: inverse (D⁻¹, for Brownian motion with "
             "diffusivity D), tensor (D itself) or adjugate (|D|D⁻¹)"
@@ -29,6 +32,7 @@ def read_volume(args: argparse.Namespace, progress: Progress) -> TensorVolume:
     """Read the tensors by `read`, and raise ValueError if they do not define a metric."""
     require_metric(args)
     volume = read(args, progress)
+    require_metric(args, volume)
     if 1 in volume.shape:
         raise ValueError(f"--slice: the volume is one voxel thick. Pass --slice {'xyz'[volume.shape.index(1)]}=0")
     require_valid(volume.with_mask(volume.grid(args.components).mask), "--repair")

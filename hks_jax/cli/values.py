@@ -73,7 +73,10 @@ def parse_times(words: list[str] | None) -> Times:
 
 def parse_folder(text: str) -> Path:
     """Return a path if it is a writable folder, or if such a folder can be created."""
-    nearest = next(folder for folder in (Path(text), *Path(text).absolute().parents) if folder.exists())
+    try:
+        nearest = next(folder for folder in (Path(text), *Path(text).absolute().parents) if folder.exists())
+    except OSError as error:  # a folder that may not be read, or a name that is too long
+        raise ArgumentTypeError(f"{error}. Choose another folder") from error
     if not nearest.is_dir():
         raise ArgumentTypeError(f"got the file {nearest}; expected a folder, or a path that does not exist")
     if not os.access(nearest, os.W_OK | os.X_OK):

@@ -56,12 +56,11 @@ def _read_tensors(
         raise ValueError(f"spacing: {name} declares {np.asarray(arrays['spacing']).tolist()}. Leave this argument out")
     given = arrays if spacing is None else {**arrays, "spacing": spacing}
     about = {"order": found.order, "frame": frame, "source": name, "invalid_by_order": found.invalid}
-    units = {key: _text(arrays, key) for key in ("length_unit", "unit")}
-    return volume_of(name, given, found.tensors, **about, **units)
+    return volume_of(name, given, found.tensors, **about)
 
 
 def volume_of(name: str, arrays: Mapping[str, Any], tensors: Float[np.ndarray, "..."], **about: Any) -> TensorVolume:
-    """Return a volume of `tensors` with the position and mask in `arrays`; by default, spacing is 1 and origin is 0."""
+    """Return a volume of `tensors` with the arrays of `place_of`; by default, spacing is 1 and origin is 0."""
     mask, affine, d = arrays.get("mask"), arrays.get("affine"), tensors.shape[-1] if tensors.ndim else 0
     axis = arrays.get("slice_axis")
     return TensorVolume(
@@ -71,6 +70,8 @@ def volume_of(name: str, arrays: Mapping[str, Any], tensors: Float[np.ndarray, "
         None if mask is None else as_mask(f"{name}: mask", mask),
         None if affine is None else _real(f"{name}: affine", affine),
         None if axis is None else np.asarray(axis).tolist(),
+        length_unit=_text(arrays, "length_unit"),
+        unit=_text(arrays, "unit"),
         **about,
     )
 
@@ -81,14 +82,13 @@ def _write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra
 
 def _write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
     record = describe_tensors(volume, "matrix", "voxel", provenance)
-    units = {name: value for name in ("length_unit", "unit") if (value := getattr(volume, name))}
-    content = {"tensors": volume.tensors, **place_of(volume), "frame": "voxel", **units, "provenance": record}
-    write_npz(path, content)
+    write_npz(path, {"tensors": volume.tensors, **place_of(volume), "frame": "voxel", "provenance": record})
 
 
 def place_of(volume: TensorVolume) -> dict[str, Any]:
-    """Return, by name, the arrays that define the position of a volume's voxels, and its mask."""
-    optional = {"mask": volume.mask, "affine": volume.affine, "slice_axis": volume.slice_axis}
+    """Return, by name, the arrays that define the position of a volume's voxels, its mask, and its known units."""
+    optional: dict[str, Any] = {"mask": volume.mask, "affine": volume.affine, "slice_axis": volume.slice_axis}
+    optional |= {"length_unit": volume.length_unit or None, "unit": volume.unit or None}
     given = {key: value for key, value in optional.items() if value is not None}
     return {"spacing": volume.spacing, "origin": volume.origin, **given}
 

@@ -115,9 +115,9 @@ def fit_dwi(
             f"path, bval, bvec: got an image of shape {image.shape}, {b.size} b-values and directions of shape "
             f"{directions.shape}; expected an image (nx, ny, nz, n), n b-values and directions (n, 3)"
         )
-    b = b / (1.0 if unit is None else UNITS[unit])
-    if question := b_value_question(float(b.max())):
+    if question := b_value_question(float(b.max()), unit or "mm2/s"):
         raise ValueError(f"{os.fspath(bval)}: {question}")
+    b = b / UNITS[unit or "mm2/s"]
     used = np.full(b.size, True) if b_max is None else b <= b_max
     threshold = max(50.0, float(b.min()))
     weighted = int((used & (b > threshold)).sum())

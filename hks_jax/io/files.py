@@ -128,8 +128,8 @@ def save(
     - ``.nrrd``: the same image with times along the last axis, and `extra` as text in the header.
     - ``.vti``: point data with ``mask`` and one array per time, whose name contains the time; field data with `extra`.
     - ``.npz``: the values as the array `name`, and the arrays in `extra`. For a volume or slice, the npz also contains
-      ``spacing`` and ``origin``, and ``mask``, ``affine`` and ``slice_axis`` unless they are None. For a mesh, the npz
-      also contains ``vertices``, and ``faces`` (triangles) or ``cells`` (tetrahedra).
+      ``spacing`` and ``origin``, and ``mask``, ``affine``, ``slice_axis``, ``length_unit`` and ``unit`` if known. For a
+      mesh, the npz also contains ``vertices``, and ``faces`` (triangles) or ``cells`` (tetrahedra).
     - ``.vtu``, ``.vtk``, ``.msh`` (Gmsh), and for triangles ``.ply``: the mesh and one array per time.
 
     Every file contains a JSON record of its origin: the version, the tensors' file with its SHA-256, order and frame,

@@ -13,7 +13,7 @@ from hks_jax.domain.components import as_mask
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.io.formats import IMAGES, format_of
 from hks_jax.io.tables import read_table
-from hks_jax.io.volume import TensorVolume, corners
+from hks_jax.io.volume import TensorVolume, corners, require_position
 from hks_jax.storage import existing, reading
 
 
@@ -36,13 +36,7 @@ def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) ->
     """
     name = os.fspath(path)
     values, place = _image(name, affine, IMAGES)
-    if affine is not None and place is not None:
-        shift = np.linalg.norm(corners(values.shape) @ (place - affine).T, axis=1).max()
-        if shift > 0.5 * np.linalg.norm(affine[:3, :3], axis=0).min():
-            raise ValueError(
-                f"{name}: the mask's affine displaces it by up to {shift:.3g} from the tensors; expected the same "
-                "position. Resample the mask to the tensors' voxels"
-            )
+    require_position(name, place, affine, values.shape)
     return as_mask(name, values)
 
 
@@ -143,18 +137,16 @@ def _image(name: str, affine: np.ndarray | None, suffixes: tuple[str, ...]) -> t
 
 def _at_voxels(name: str, values: np.ndarray, to_labels: np.ndarray, volume: TensorVolume) -> np.ndarray:
     """Return the labels at an image's voxels; raise ValueError if labels and image are not on the same voxels."""
-    size = list(volume.shape)
-    if len(size) == 2:
-        size.insert(volume.thin_axis, 1)
-    first, ends = np.rint(to_labels[:3, 3]).astype(int), corners(tuple(size))
+    size = volume.volume_shape
+    first, ends = np.rint(to_labels[:3, 3]).astype(int), corners(size)
     apart = np.abs((ends @ to_labels.T)[:, :3] - ends[:, :3] - first).max()
     box = tuple(slice(int(i), int(i) + n) for i, n in zip(first, size, strict=True))
     inside = all(i >= 0 and i + n <= m for i, n, m in zip(first, size, values.shape, strict=True))
     if apart > 0.1 or not inside:  # in voxels
-        if values.shape != tuple(size) and np.allclose(to_labels, np.eye(4)):
+        if values.shape != size and np.allclose(to_labels, np.eye(4)):
             raise ValueError(
                 f"{name}: got labels of shape {values.shape} with the image's affine; expected the image's shape "
-                f"{tuple(size)}. One file was cropped or resampled without its affine: resample the labels to the image"
+                f"{size}. One file was cropped or resampled without its affine: resample the labels to the image"
             )
         raise ValueError(
             f"{name}: the affines put the labels and the image on different voxels; expected the same voxels. "

@@ -130,7 +130,12 @@ def read_tensors(name: str, order: str | None, frame: str | None, image: Any = N
     found = matrices(name, voxels(name, image).reshape(*shape[:3], 6), order, "nifti" if declared else by_bids)
     if declared and found.order != "nifti":
         notes.append(f'components read in order "{order}", as asked; the file declares NIfTI\'s symmetric-matrix order')
-    declared_frame = _REFERENCES.get(encoding.get("Reference", ""), record.get("frame"))
+    by_sidecar = _REFERENCES.get(encoding.get("Reference", ""))
+    declared_frame = record.get("frame", by_sidecar)
+    if by_sidecar not in (None, declared_frame):  # the sidecar may describe an earlier image of the same name
+        notes.append(
+            f"the {by_sidecar} axes of the sidecar are ignored, because the image declares {declared_frame} axes"
+        )
     open_frame = frame is None and declared_frame is None and found.order == "nifti"
     if frame is not None and declared_frame not in (None, frame):
         notes.append(f"components read along the {frame} axes, as asked; the file declares the {declared_frame} axes")
@@ -204,8 +209,7 @@ def read_components(paths: Sequence[str], order: str | None, frame: str | None) 
         if not np.allclose(affine_in_mm(files[name], image)[0], affine, rtol=1e-4, atol=1e-3):
             raise ValueError(f"{files[name]}: its affine differs from that of {files['xx']}; expected equal affines")
     values = np.stack([voxels(files[name], image) for name, image in zip(names, images, strict=True)], axis=-1)
-    joined = optional("nibabel").Nifti1Image(values.reshape(*first.shape[:3], 1, 6), first.affine)
-    joined.header["xyzt_units"] = first.header["xyzt_units"]
+    joined = optional("nibabel").Nifti1Image(values.reshape(*first.shape[:3], 1, 6), first.affine, first.header)
     joined.header.set_intent(SYMMETRIC_MATRIX, (3,))
     return read_tensors(files["xx"], None, frame, joined)
 

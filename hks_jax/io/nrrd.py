@@ -164,7 +164,8 @@ def _read_tensors(name: str, order: str | None, frame: str | None, confidence: f
     affine = place.affine
     tensors, frame = _to_voxel_axes(name, found.tensors, frame, place, notes)
     if affine is not None and place.signs is None:
-        notes.append(f"the affine's axes are the axes of the file's space, {header.get('space', 'unnamed')!r}")
+        space = f"the axes of the file's space, {header.get('space', 'unnamed')!r}"
+        notes.append(f"the affine's axes are {space}; pictures take them as right, anterior and superior")
     elif affine is None and d == 2 and not np.allclose(place.directions, np.diag(spacing)):
         notes.append("the coordinate axes are the axes of the 2D image; directions of its axes in the file are ignored")
     if place.unit not in ("", "mm"):

@@ -120,14 +120,15 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
     }
     if not count:
         return replace(volume, repair=report)
-    if count == of:
-        raise ValueError(f"repair: none of the {of} tensors is positive definite. Check the order of components")
-    if count > MANY * of:
-        warn_of_accuracy(
-            f"repair: {count} of {of} tensors ({count / of:.0%}) are not positive definite, so the signature depends "
-            f"strongly on the repair. {_why_so_many(volume, volume.tensors[finite])}"
-        )
     wrong = "are not positive definite" if floor is None else f"have an eigenvalue below {floor:g}"
+    if count > MANY * of:
+        why = _why_so_many(volume, volume.tensors[finite], floor)
+        if count == of:
+            raise ValueError(f"repair: all {of} tensors {wrong}. {why}")
+        warn_of_accuracy(
+            f"repair: {count} of {of} tensors ({count / of:.0%}) {wrong}, so the signature depends strongly on the "
+            f"repair. {why}"
+        )
     worst = f" (the worst eigenvalue is {report['worst_eigenvalue']:.3g})" if finite.any() else ""
     tensors, changed = volume.tensors.copy(), dict[str, Any]()
     if method == "mask":
@@ -159,9 +160,11 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
     return replace(volume, tensors=tensors, **changed, repair=report, notes=notes)
 
 
-def _why_so_many(volume: TensorVolume, finite: Float[np.ndarray, "n d d"]) -> str:
+def _why_so_many(volume: TensorVolume, finite: Float[np.ndarray, "n d d"], floor: float | None = None) -> str:
     """Return a possible reason for many invalid tensors, such as a wrong order; `finite` has the finite ones."""
     question = "" if volume.invalid_by_order is None else volume.invalid_by_order.question
+    if floor is not None and not question:
+        return "Choose a lower floor, or leave out voxels at the boundary of the mask"
     if question or not len(finite):
         return question or "Noise does not explain so many invalid tensors. Programs often write NaN outside a mask"
     largest = np.abs(np.linalg.eigvalsh(finite.astype(np.float64))).max()

@@ -105,10 +105,10 @@ class Result:
             about |= {"source": record.get("source") or "", "digest": record.get("sha256") or ""}
             about |= {"notes": tuple(record.get("notes", ()))}
             place = volume_of(str(path), arrays, tensors, **about)
-        elif "cells" in arrays:
-            place = TetMesh(arrays["vertices"], arrays["cells"])
         else:
-            place = SurfaceMesh(arrays["vertices"], arrays["faces"])
+            kind, cells = (TetMesh, arrays["cells"]) if "cells" in arrays else (SurfaceMesh, arrays["faces"])
+            # Only a mesh with a mask may have vertices that belong to no cell, which are outside the domain.
+            place = kind(arrays["vertices"], cells, mask=np.ones(cells.shape[:1], bool))
         eigenvalues, report = arrays.get("eigenvalues", np.zeros(0)), {"settings": record.get("settings") or {}}
         more = {n: a for n, a in arrays.items() if n in ("deviation", "noise_maps", "scaled_times", "input_tensors")}
         return cls(place, values, times, eigenvalues, report, more, name, str(path))
@@ -203,14 +203,13 @@ class Result:
     def unit(self) -> str:
         """The unit of t: seconds for the metric D⁻¹ of tensors in mm²/s and lengths in mm; empty if it is not known."""
         place = self.place
-        known = isinstance(place, TensorVolume) and (place.order == "fit" or (place.unit and place.length_unit == "mm"))
+        known = isinstance(place, TensorVolume) and place.unit and place.length_unit == "mm"
         return "s" if known and self.settings.get("metric") == "inverse" else ""
 
     @property
     def length_unit(self) -> str:
-        """The unit of lengths: mm for a volume with an affine, empty for a mesh, otherwise the volume's unit."""
-        place = self.place
-        return "" if not isinstance(place, TensorVolume) else place.length_unit if place.affine is None else "mm"
+        """The unit of lengths: the volume's unit, or empty for a mesh."""
+        return getattr(self.place, "length_unit", "")
 
 
 def signature_file(result: Path) -> Path:

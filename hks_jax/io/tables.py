@@ -38,7 +38,8 @@ def cell(value: Any) -> str:
 def write_json(path: Path, content: Mapping[str, Any]) -> Path:
     """Write a JSON file atomically and return its path."""
     with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+        text = json.dumps(content, indent=2, ensure_ascii=False) + "\n"
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")  # file names may be invalid in UTF-8
     return path
 
 

@@ -96,15 +96,15 @@ def median_mean_diffusivity(volume: TensorVolume) -> float:
     return float(np.median(means)) if means.size else 0.0
 
 
-def b_value_question(largest: float) -> str:
-    """Return a message if the largest b-value, in s/mm², is implausible, or else the empty text."""
-    low, high = _B_VALUES
-    if low <= largest <= high:
+def b_value_question(largest: float, unit: str) -> str:
+    """Return a message if the largest b-value, in the reciprocal of `unit`, is implausible, or else the empty text."""
+    (low, high), read = _B_VALUES, largest / UNITS[unit]
+    if low <= read <= high:
         return ""
     for name, scale in UNITS.items():
         if low <= largest / scale <= high:
             return (
-                f"the largest b-value is {largest:g}; expected {low:g} to {high:g} s/mm². If the b-values are in "
+                f"the largest b-value is {read:g}; expected {low:g} to {high:g} s/mm². If the b-values are in "
                 f'1/({name}), the largest is {largest / scale:g} s/mm²: pass unit "{name}"'
             )
     return ""

@@ -109,8 +109,13 @@ class TensorVolume:
         if mask is not None and not (isinstance(mask, np.ndarray) and mask.shape == shape and mask.dtype == bool):
             got, remedy = describe_array(mask), ". `read_mask` reads a file" * isinstance(mask, str | os.PathLike)
             raise ValueError(f"{where}mask: got {got}; expected a bool array of shape {shape}{remedy}")
-        if self.affine is not None and (self.affine.shape != (4, 4) or not np.isfinite(self.affine).all()):
-            raise ValueError(f"{where}affine: got shape {self.affine.shape}; expected finite numbers of shape (4, 4)")
+        if (affine := self.affine) is not None and (
+            affine.shape != (4, 4) or not np.isfinite(affine).all() or np.linalg.det(affine[:3, :3]) == 0
+        ):
+            raise ValueError(f"{where}affine: got {affine.tolist()}; expected an invertible matrix of shape (4, 4)")
+        for name, unit, known in (("length_unit", self.length_unit, "mm"), ("unit", self.unit, "mm²/s")):
+            if unit not in ("", known):
+                raise ValueError(f"{where}{name}: got {unit!r}; expected {known!r} or nothing. Convert the numbers")
         if self.slice_axis not in ((None,) if d == 3 else (None, 0, 1, 2)):
             raise ValueError(f"{where}slice_axis: got {self.slice_axis} for {d} axes; expected 0, 1 or 2 for a slice")
         if covariance is not None and covariance.shape != (*shape, *[d * (d + 1) // 2] * 2):
@@ -213,6 +218,11 @@ class TensorVolume:
         return affine
 
     @property
+    def volume_shape(self) -> tuple[int, ...]:
+        """The shape as a volume, in which a slice is one voxel thick."""
+        return self.shape if self.dimension == 3 else tuple(np.insert(self.shape, self.thin_axis, 1).tolist())
+
+    @property
     def thin_axis(self) -> int:
         """The axis along which a slice is one voxel thick when it is written as a volume; z by default."""
         return 2 if self.slice_axis is None else self.slice_axis
@@ -241,6 +251,18 @@ def corners(shape: tuple[int, ...]) -> Int[np.ndarray, "8 4"]:
     """Return the homogeneous indices (i, j, k, 1) of the voxels at the corners of an image in 2D or 3D."""
     ends = ((0, n - 1) for n in (*shape, 1)[:3])
     return np.stack(np.meshgrid(*ends, [1], indexing="ij"), -1).reshape(-1, 4)
+
+
+def require_position(name: str, affine: Any, expected: Any, shape: tuple[int, ...], of: str = "the tensors") -> None:
+    """Raise ValueError if the affine of an image displaces its voxels from `expected`; an affine None is unknown."""
+    if affine is None or expected is None:
+        return
+    shift = np.linalg.norm(corners(shape) @ (affine - expected).T, axis=1).max()
+    if shift > 0.5 * np.linalg.norm(expected[:3, :3], axis=0).min():
+        raise ValueError(
+            f"{name}: the affine displaces this image by up to {shift:.3g} from {of}; expected the same position. "
+            f"Resample the image to the voxels of {of}"
+        )
 
 
 def images_of(array: np.ndarray, volume: TensorVolume) -> np.ndarray:

@@ -85,6 +85,9 @@ def _read_tensors(name: str, order: str | None, frame: str | None, array: str | 
     volume = placed(name, found, frame or "world", affine, mask=inside, length_unit="")
     if np.array_equal(affine[:3, :3], np.diag(volume.spacing)):
         volume = replace(volume, affine=None, origin=tuple(affine[:3, 3].tolist()))
+    else:
+        note = "VTK does not name the axes of space; pictures take them as right, anterior and superior"
+        volume = replace(volume, notes=(*volume.notes, note))
     return _as_plane(volume)
 
 
@@ -121,9 +124,9 @@ def _store(path: Path, arrays: dict[str, np.ndarray], volume: TensorVolume, reco
 
     affine = volume.volume_affine
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
-    shape = np.array(volume.shape) if volume.dimension == 3 else np.insert(volume.shape, volume.thin_axis, 1)
+    shape = volume.volume_shape
     image = vtkImageData()
-    image.SetDimensions(*shape.tolist())
+    image.SetDimensions(*shape)
     image.SetSpacing(*spacing.tolist())
     image.SetOrigin(*affine[:3, 3].tolist())
     image.SetDirectionMatrix(*(affine[:3, :3] / spacing).ravel().tolist())

@@ -124,12 +124,15 @@ def line_integral_convolution(
     require_plane("field", field.grid)
     if not 0 < contrast <= 1:
         raise ValueError(f"contrast: got {contrast}; expected a number in (0, 1]")
+    grid = field.grid
+    if kwargs.get("orientation") is not None:
+        field = kwargs["orientation"].field(field)
     x0, x1, y0, y1 = field.grid.extent
     if pixels is None:
         pixels = int(np.clip(PIXELS_PER_INCH * side_in_inches(ax, (x1 - x0, y1 - y0)), 100, 1200))
     texture = lic_texture(field, which, pixels=pixels, length=length)
     if values is not None:
-        scalar_image(ax, values, field.grid, **{"interpolation": "bilinear", **kwargs})
+        scalar_image(ax, values, grid, **{"interpolation": "bilinear", **kwargs})
     shift = contrast * (2 * texture.T - 1)
     shade = np.zeros((*shift.shape, 4))
     if ax.images:

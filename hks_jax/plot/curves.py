@@ -159,7 +159,7 @@ def spectrum(
     ax.set_xlim(0, 1.02 * fine[-1])
     ax.set_xlabel(rf"$\lambda${' in ' * bool(unit)}{unit}")
     ax.set_ylabel(r"$N(\lambda)$ minus Weyl's law" if remainder else r"$N(\lambda)$")
-    ax.ticklabel_format(useMathText=True)
+    ax.ticklabel_format(scilimits=(-3, 4), useMathText=True)
     ax.tick_params(labelsize=SMALL)
     ax.grid(visible=True, linewidth=0.4, alpha=0.5)
     ax.legend(fontsize=SMALL, frameon=False)

@@ -12,7 +12,6 @@ from matplotlib.colors import TABLEAU_COLORS
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from hks_jax.domain.tensor_field import TensorField
 from hks_jax.plot.figure import SMALL, finished, new_figure, number_text, panel_size, require_plane
 from hks_jax.plot.glyphs import ellipses
 from hks_jax.plot.images import masked, panel_colours, scalar_image
@@ -72,9 +71,7 @@ def fit_panels(
     drawn = np.abs(difference[rows][:, grid.inside])
     limit = max(float(np.max(drawn[np.isfinite(drawn)], initial=0.0)), LEAST_DIFFERENCE)
 
-    field = fit.field
-    if orientation is not None:
-        field = TensorField(orientation.grid(grid), orientation.tensors(field.tensors), field.interpolation)
+    field = fit.field if orientation is None else orientation.field(fit.field)
     width, height = panel_size(field.grid, 2.5)
     # The last row is at least 1.8 inches high, because it also contains the plot of the loss.
     heights = [height] * len(rows) + [max(height, 1.8)]

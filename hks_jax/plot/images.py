@@ -126,6 +126,8 @@ def influence_map(
     values = masked("influence", influence, grid)
     style = {"cmap": "cividis", "vmin": 0.0, "vmax": 1.0, "label": "boundary's influence", **kwargs}
     image = scalar_image(ax, values, grid, **style)
+    if (orientation := style.get("orientation")) is not None:
+        values, grid = orientation.array(values), orientation.grid(grid)
     if reached := [level for level in levels if values.min() < level < values.max()]:
         lines = ax.contour(*grid.axes, values.T, levels=reached, colors="white", linewidths=1.0)
         ax.clabel(lines, fmt=lambda level: f"{100 * level:g} %", fontsize="x-small")

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 
 from hks_jax.domain.grid import Grid
+from hks_jax.domain.tensor_field import TensorField
 
 View = Literal["neurological", "radiological"]
 LETTERS = ("LR", "PA", "IS")
@@ -105,6 +106,10 @@ class Orientation(NamedTuple):
         signs = np.where(self.turned, -1, 1)
         components = np.moveaxis(np.asarray(values), (-2, -1), (0, 1))[np.ix_(self.axes, self.axes)]
         return np.moveaxis(self.array(components), (0, 1), (-2, -1)) * np.outer(signs, signs)
+
+    def field(self, field: TensorField) -> TensorField:
+        """Return a tensor field in the order of the image, with components along its axes."""
+        return TensorField(self.grid(field.grid), self.tensors(field.tensors), field.interpolation)
 
     def node(self, node: Sequence[int], shape: Sequence[int]) -> tuple[int, ...]:
         """Return a node's indices in the image from its indices in an array of the given shape."""

@@ -69,7 +69,7 @@ def surface(
     if isinstance(mesh, TetMesh):
         mesh, numbers = mesh.boundary()
         scalars = scalars[numbers]
-    vertices = np.asarray(mesh.vertices, dtype=np.float64)
+    vertices, used = np.asarray(mesh.vertices, dtype=np.float64), mesh.triangulation.used
     corners = vertices[mesh.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -77,7 +77,7 @@ def surface(
     brightness = 1 - relief * (1 - np.abs(normals @ LIGHT) / np.linalg.norm(LIGHT))
 
     mappable = ScalarMappable(Normalize(vmin, vmax), colormaps[cmap])
-    mappable.set_array(scalars)
+    mappable.set_array(scalars[used])
     mappable.autoscale_None()
     colours = mappable.to_rgba(scalars[mesh.faces].mean(axis=1))
     colours[:, :3] *= brightness[:, None]
@@ -85,7 +85,7 @@ def surface(
     ax.add_collection3d(
         Poly3DCollection(corners, facecolors=colours, edgecolors=colours, **{"linewidths": 0.2, **kwargs})
     )
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    low, high = vertices[used].min(axis=0), vertices[used].max(axis=0)
     thin = np.maximum(1e-3 * (high - low).max() - (high - low), 0) / 2  # gives a flat surface a thin bounding box
     low, high = low - thin, high + thin
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))

@@ -29,7 +29,7 @@ _SIGNS = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
 """The corners of a regular tetrahedron: the corners of the cube with an even number of minus signs."""
 _BALANCED = len(_SIGNS)
 """The number of noisy tensor fields in one balanced sample, one for each corner of the tetrahedron."""
-_LEAST = 8
+LEAST = 8
 """The least number of noisy tensor fields for estimates of the bias and of the variance's second-order part."""
 _SCALE = 0.5
 """The factor s of samples of the noise. It is less than 1, because the measured tensors already contain noise."""
@@ -164,7 +164,7 @@ def uncertainty(
             raise ValueError('method: got "auto" for traced arrays; expected "resample", "linear" or "exact" under jit')
         size = sum(leaf.size for leaf in jax.tree.leaves(value))
         method = "exact" if compiled and size <= draws else "resample"
-    samples = -(-draws // _BALANCED) if method == "resample" else _LEAST // _BALANCED
+    samples = -(-draws // _BALANCED) if method == "resample" else LEAST // _BALANCED
     moments = _sampled(run, value, measured, noise, seed, samples, progress, checkpoint, each)
     variance = jax.tree.map(lambda odd: odd / samples, moments.odd)
     spread = jax.tree.map(lambda s: s / (samples - 1), moments.spread)
@@ -200,7 +200,7 @@ def _check(measured: Array, noise: TensorNoise, method: str, draws: int, smoothi
         raise TypeError(f"noise: got {type(noise).__name__}; expected hks_jax.TensorNoise")
     if method not in get_args(Method):
         raise ValueError(f"method: got {method!r}; expected one of {', '.join(get_args(Method))}")
-    require_count("draws", draws, _LEAST)
+    require_count("draws", draws, LEAST)
     require_number("smoothing", smoothing, inclusive=True)
     if smoothing and noise.grid is None:
         raise ValueError("smoothing: got a length, but the noise has no grid. Pass the tensors' grid to TensorNoise")

@@ -382,6 +382,7 @@ def test_the_command_line_keeps_what_it_compiled_and_the_package_nothing(npz, tm
 
 
 def test_module_runs_in_a_process_of_its_own(npz, tmp_path):
+    out = tmp_path / os.fsdecode("λ".encode() + b"\xff")  # printed in ASCII, and invalid in UTF-8
     command = [
         sys.executable,
         "-m",
@@ -389,16 +390,21 @@ def test_module_runs_in_a_process_of_its_own(npz, tmp_path):
         "hks",
         str(npz),
         "-o",
-        str(tmp_path / "out"),
+        str(out),
         "-k",
         "10",
         "--times",
         "1",
+        "--dtype",
+        "float32",
     ]
-    done = subprocess.run([*command, "--dtype", "float32"], capture_output=True, text=True, timeout=300, check=False)
+    ascii_only = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=ascii_only)
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
-    with np.load(tmp_path / "out" / "hks.npz") as read:
+    assert "\\u03bb\\udcff/hks.npz\n" in done.stdout
+    assert str(out) in json.loads((out / "report.json").read_text())["command"]
+    with np.load(out / "hks.npz") as read:
         assert read["hks"].dtype == np.float32  # with 64 bits off, not merely cast
         assert read["eigenvalues"].dtype == np.float32
 
@@ -469,6 +475,7 @@ def test_paper_passes_its_flags_on(tmp_path, monkeypatch, capsys):
         (["-k", "5000"], ["k: got 5000", "number of degrees of freedom"]),
         (["--times", "0", "1"], ["--times", "'0 1'", "expected positive numbers, or auto"]),
         (["--times", "auto:no"], ["--times", "auto:N"]),
+        (["-o", 300 * "a"], ["--output", "name too long", "Choose another folder"]),
         (["--slice", "14"], ["--slice", "such as z=14"]),
         (["--slice", "z=1"], ["slice", "expected a volume with three axes"]),
         (["--boundary", "robin"], ["boundary: got 'robin'", "'neumann'"]),
@@ -612,7 +619,7 @@ def test_parsing():
     assert parse_boundary("neumann:dirichlet") == (("neumann", "dirichlet"),)
 
 
-def test_progress_is_silent_when_quiet_but_for_warnings(capsys):
+def test_progress_is_silent_when_quiet_but_for_warnings(capsys, monkeypatch):
     progress = Progress(quiet=True)
     with progress.stage("work"):
         progress.update("half")
@@ -622,6 +629,8 @@ def test_progress_is_silent_when_quiet_but_for_warnings(capsys):
     assert capsys.readouterr().err == "warning: mind this\n"
     assert progress.warnings == ["mind this"]
     assert progress.timings["work"] > 0
+    monkeypatch.setattr("sys.stderr", None)  # closed, as for programs without a console
+    Progress().note("by the way")
 
 
 def test_a_bar_and_the_time_left_on_a_terminal(monkeypatch):
@@ -714,9 +723,9 @@ def test_a_fit_has_the_boundary_that_its_target_says(conformal, tmp_path):
 @pytest.mark.slow
 def test_fit_end_to_end_recovers_the_metric(conformal, tmp_path, capsys):
     tensors, values = conformal
-    target, out = write_target(tmp_path / "target.npz", values), tmp_path / "out"
+    target, out = write_target(tmp_path / "hks.npz", values), tmp_path / "out"
     arguments = ["--max-steps", "4", "-q", "--json", *FIT_ARGUMENTS]
-    assert main(["fit", str(target), "-o", str(out), *arguments]) == 0
+    assert main(["fit", str(tmp_path), "-o", str(out), *arguments]) == 0  # the folder of a signature
     assert sorted(file.name for file in out.iterdir()) == ["fit.npz", "fit.png", "report.json", "tensors.npz"]
     assert (out / "fit.png").read_bytes()[:4] == b"\x89PNG"
 
@@ -781,12 +790,19 @@ def test_an_interrupted_fit_writes_the_best_so_far(conformal, tmp_path, capsys, 
     [
         ([], {"times": None, "spacing": None}, ["the arrays hks, origin;", "Add times, spacing"]),
         ([], {"times": FIT_TIMES[:2]}, ["hks of shape (3, 14, 13)", "times of shape (2,)"]),
+        (
+            [],
+            {"provenance": '{"settings": {"normalisation": "flat"}}'},
+            ["TARGET: got", "flat; expected raw"],
+        ),
         ([], {"hks": np.nan}, ["target: got 1 of 546 observed values that are NaN", "(2, 3, 4)"]),
         (["--init", "init.npz"], {}, ["--init: got tensors of shape (14, 12)", "the target's shape (14, 13)"]),
         (["--init", "volume.npz"], {}, ["shape (5, 4, 3)", "hks-jax convert volume.npz slice.npz --slice"]),
+        (["--init", "moved.npz"], {"affine": np.eye(4)}, ["--init: the affine displaces", "up to 3 from the target"]),
         (["--metric", "inverse"], {}, ["--metric", "--init"]),
         (["--init", "init.nii.gz"], {}, ["--metric: choose"]),
         (["--init", "init.nrrd"], {}, ["--metric: choose"]),
+        (["--init", "scan.npz"], {}, ["--metric: choose"]),
         (["--init", "init.vti"], {}, ["--metric: choose"]),
         (["--h1", "-1"], {}, ["--h1: got '-1'; expected a positive number"]),
     ],
@@ -799,6 +815,9 @@ def test_fit_errors_are_one_line_and_leave_nothing(conformal, tmp_path, capsys, 
     write_target("target.npz", values, **changes)
     np.savez("init.npz", tensors=metric())
     np.savez("volume.npz", tensors=np.broadcast_to(np.eye(3), (5, 4, 3, 3, 3)))
+    moved = np.eye(4) + 3.0 * np.eye(4)[:, [3, 0, 1, 2]] * [0, 0, 0, 1]
+    np.savez("scan.npz", tensors=metric(), length_unit="mm")
+    np.savez("moved.npz", tensors=np.tile(np.eye(2), (*FIT_GRID.shape, 1, 1)), affine=moved)
     before = sorted(tmp_path.iterdir())
     assert one_error(capsys, main(["fit", "target.npz", "-o", "out", *arguments]), *words) == 2
     assert sorted(tmp_path.iterdir()) == before
@@ -846,11 +865,26 @@ def test_the_rim_of_a_mask_is_no_signal(tmp_path):
     assert noise["signal_to_noise"][2] is noise["exceeds_2_from_t"] is None
 
 
-def test_error_bars_are_refused_where_there_are_none(npz, tmp_path, capsys):
-    for words, text in (
-        (["--noise", "residuals"], "--noise: got residuals, which need a fit"),
-        (["--noise", "0.1", "--method", "auto"], "--noise: got --method auto; expected spectral"),
-        (["--noise", str(tmp_path / "absent.npz")], "absent.npz"),
+def test_error_bars_are_refused_where_there_are_none(npz, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("hks_jax.cli.hks.compute_pairs", None)  # which may take hours, so errors come before it
+    tensors, moved = np.tile(np.eye(3), (4, 4, 4, 1, 1)), np.eye(4)
+    moved[0, 0], moved[0, 3] = -1.0, 3.0  # the same voxels, stored from right to left
+    volume, mirrored = tmp_path / "volume.npz", str(tmp_path / "mirrored.npz")
+    np.savez(volume, tensors=tensors, affine=np.eye(4))
+    np.savez(mirrored, tensors=tensors + np.eye(3), affine=moved)
+    cropped = str(tmp_path / "cropped.npz")
+    np.savez(cropped, tensors=tensors * (np.arange(4) > 0)[:, None, None], affine=np.eye(4))
+    for file, words, text in (
+        (volume, ["--slice", "x=2", "-k", "4", "--noise", cropped], "without tensors at 4 of the 16 voxels"),
+        (npz, ["--noise", "residuals"], "--noise: got residuals, which need a fit"),
+        (npz, ["--noise", "0.1", "--method", "auto"], "--noise: got --method auto; expected spectral"),
+        (npz, ["--noise", "0.1", "--draws", "4"], "--draws: got 4; expected an integer of at least 8"),
+        (npz, ["--noise", str(tmp_path / "absent.npz")], "absent.npz"),
+        (
+            volume,
+            ["--slice", "x=2", "-k", "4", "--noise", mirrored],
+            "displaces this image by up to 1 from",
+        ),
     ):
-        assert main(["hks", str(npz), "-o", str(tmp_path / "out"), "--metric", "inverse", "-q", *words]) != 0
+        assert main(["hks", str(file), "-o", str(tmp_path / "out"), "--metric", "inverse", "-q", *words]) == 2
         assert text in capsys.readouterr().err

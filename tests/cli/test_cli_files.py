@@ -8,6 +8,7 @@ from pathlib import Path
 import nibabel as nib
 import numpy as np
 import pytest
+from matplotlib.image import imread
 
 import hks_jax as hj
 from hks_jax.cli import main
@@ -197,17 +198,17 @@ def test_info_of_invalid_tensors_and_meshes(tmp_path, capsys):
 def test_info_of_results_says_what_they_are_and_how_to_draw_them(tensors, tmp_path, capsys):
     volume = read_tensors(tensors)
     report = {"settings": {"metric": "inverse", "normalisation": "flat"}}
-    (tmp_path / "out").mkdir()
+    (tmp_path / "my out").mkdir()
     result = Result(volume, np.ones((8, *SHAPE)), np.arange(1.0, 9.0), report=report)
-    result.save(tmp_path / "out" / "hks", ".nii.gz")
+    result.save(tmp_path / "my out" / "hks", ".nii.gz")
     replace(result, values=np.ones((1, *SHAPE)), times=np.zeros(0), name="curvature").save(tmp_path / "K", "")
-    for name in ("out", "out/hks.npz", "out/hks.nii.gz"):
+    for name in ("my out", "my out/hks.npz", "my out/hks.nii.gz"):
         assert main(["info", str(tmp_path / name)]) == 0
         text = capsys.readouterr().out
         assert "result          heat kernel signature\n" in text
         assert "times           1, 2, 3, 4, 5, 6, 7, 8\n" in text
         assert "normalisation   flat\n" in text
-        assert f"hks-jax plot {tmp_path / 'out' / 'hks.npz'} -o picture.png\n" in text
+        assert f"hks-jax plot '{tmp_path / 'my out' / 'hks.npz'}' -o picture.png\n" in text
     assert main(["info", str(tmp_path / "K.npz"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["result"], found["times"], found["to draw it"]) == (
@@ -269,7 +270,7 @@ def test_signature_of_a_solid_with_tensors_at_its_vertices(tmp_path, capsys):
         assert main([*command, *more]) == 2
         assert message in capsys.readouterr().err
 
-    refused("--noise: this option needs tensors, which", "--noise", "0.1")
+    refused("--noise: this option needs tensors; saved", "--noise", "0.1")
     refused("--noise: got 'roughness'; expected a number", *of_tensors, "--noise", "roughness")
     refused("--metric: this option needs tensors, but without --array", "--metric", "tensor")
     refused("--interpolation: this option needs tensors", "--interpolation", "log-euclidean")
@@ -280,7 +281,7 @@ def test_signature_of_a_solid_with_tensors_at_its_vertices(tmp_path, capsys):
     refused("--array: got 'D' with 9 components", "--array", "D", "--metric", "tensor", "--order", "vtk")
 
 
-def test_signature_of_a_surface_without_some_vertices(tmp_path):
+def test_signature_of_a_surface_without_some_vertices(tmp_path, capsys):
     meshio = pytest.importorskip("meshio")
     sphere = hj.examples.sphere_mesh(3)
     meshio.Mesh(np.asarray(sphere.vertices), [("triangle", sphere.faces)]).write(tmp_path / "s.vtk")
@@ -293,6 +294,18 @@ def test_signature_of_a_surface_without_some_vertices(tmp_path):
     assert main(["hks", str(tmp_path / "s.vtk"), "-o", str(tmp_path / "out"), *more]) == 0
     with np.load(tmp_path / "out" / "hks.npz") as found:
         np.testing.assert_allclose(found["hks"], expected, rtol=1e-5)
+    picture = imread(tmp_path / "out" / "hks.png")[..., :3]
+    assert np.ptp(picture[:, : picture.shape[1] // 2], axis=-1).max() > 0.3  # the surface has colours
+    np.testing.assert_allclose(hj.io.Result.read(tmp_path / "out").values, expected, rtol=1e-5)
+    np.save(tmp_path / "none.npy", np.zeros(len(inside), bool))
+    for words, text in (
+        (["--inside", str(tmp_path / "none.npy")], "--inside: 0 of 92 vertices are inside"),
+        ([str(tmp_path / "s.vtk")], "FILE: got 2 files; expected one mesh"),
+    ):
+        assert main(["hks", str(tmp_path / "s.vtk"), *words, "-o", str(tmp_path / "out"), "-q"]) == 2
+        assert text in capsys.readouterr().err
+    np.save(tmp_path / "labels.npy", 7 + (np.asarray(sphere.vertices)[:, 0] > 0))
+    assert main(["explore", str(tmp_path / "out"), "--labels", str(tmp_path / "labels.npy"), "-q"]) == 0
 
 
 # ---------------------------------------------------------------------------------------------------- convert
@@ -312,6 +325,8 @@ def test_convert_to_every_format_and_back(tensors, tmp_path, capsys):
         if name != "t.nii":
             np.testing.assert_array_equal(read.mask, disc())
     assert capsys.readouterr().err == ""
+    assert main(["spectrum", str(tmp_path / "t.npz"), "-o", str(tmp_path / "out"), "-q"]) == 2
+    assert "--metric: choose the metric of the diffusion tensors" in capsys.readouterr().err
 
 
 def test_convert_orders_masks_and_repairs(tmp_path, capsys):
@@ -411,6 +426,7 @@ def test_messages_name_the_options():
         ("Pass order (--order), one of these", "Pass --order, one of these"),
         ('Pass components="largest", or components="all"', "Pass --components largest, or --components all"),
         ("k: got 0; expected 1", "-k: got 0; expected 1"),
+        ("iterations: got -1; expected 0", "--erode: got -1; expected 0"),
         ("b_max: 10 leaves none", "--b-max: 10 leaves none"),
         ("outside, pass the mask or mask them", "outside, pass the mask or mask them"),
     ):

@@ -160,6 +160,8 @@ def test_six_images_say_by_their_sidecar_along_which_axes_they_are(tmp_path):
     # World axes: x is −j, y is i, z is −k here.
     axes = AFFINE[:3, :3] / [2, 2, 3]
     np.testing.assert_allclose(read_tensors(paths, frame="world").tensors, axes.T @ tensors() @ axes, atol=1e-15)
+    unplaced = write_six(tmp_path, tensors(), None, "dt{}.nii")
+    assert "the file has neither sform nor qform, so left and right are a guess" in read_tensors(unplaced).notes
 
 
 def test_what_are_not_six_images_is_refused(tmp_path):
@@ -298,6 +300,12 @@ def test_a_study_is_a_bids_derivative(study, monkeypatch):
     (row,) = (row for row in table(study / "r.tsv") if row["index"] == "17")
     assert (row["region"], row["voxels"], row["coverage"]) == ("left half", "32", "1")
     assert float(row["volume"]) == 32 * 12  # mm³
+
+    # The regions of a signature that is computed again without labels are gone.
+    assert (out / "group_regions.tsv").is_file()
+    words = command(study, "out", "--times", "3e3", "--only", "sub-01", "--replace", "--normalisation", "flat", "-q")
+    assert main([word for word in words if word not in ("--atlas", str(atlas))]) == 0
+    assert not list(out.rglob("*regions*"))
 
 
 def test_one_bad_subject_does_not_stop_the_others(study, monkeypatch, capsys):

@@ -270,6 +270,11 @@ def test_a_sidecar_says_the_axes_of_one_image(tmp_path, reference, frame):
     assert read.frame == frame
     assert OPEN_FRAME not in read.notes
     np.testing.assert_array_equal(read.tensors, read_tensors(path, frame=frame).tensors)
+    # A file that `save_tensors` writes beside an old sidecar is along the voxel axes.
+    own = read_tensors(save_tensors(path, read))
+    np.testing.assert_allclose(own.tensors, read.tensors, rtol=1e-6, atol=1e-12)
+    assert own.frame == "voxel"
+    assert any("of the sidecar are ignored" in note for note in own.notes) == (frame != "voxel")
 
 
 def test_a_sidecar_says_the_order_of_a_tensor(tmp_path):

@@ -300,7 +300,7 @@ def test_bad_masks(tmp_path, volume):
     elsewhere = volume.affine.copy()
     elsewhere[0, 3] += 2.0
     write_components(tmp_path / "m.nii", volume.mask.astype(np.uint8), elsewhere)
-    with pytest.raises(ValueError, match="displaces it by up to 2 from"):
+    with pytest.raises(ValueError, match="displaces this image by up to 2 from"):
         hj.io.read_tensors(tmp_path / "t.nii", mask=tmp_path / "m.nii")
     np.savez(tmp_path / "m.npz", inside=volume.mask)
     with pytest.raises(ValueError, match="got the arrays inside; expected an array 'mask'"):
@@ -392,6 +392,10 @@ def test_results_that_cannot_be_saved(tmp_path, volume):
         hj.io.save(tmp_path / "v.nii", np.zeros(SHAPE), volume, extra={"eigenvalues": [1]})
     with pytest.raises(ValueError, match="slice_axis: got 3 for 2 axes"):
         replace(volume.slice("z", 1), slice_axis=3)
+    with pytest.raises(ValueError, match=r"affine: got \[\[0.0, .* expected an invertible matrix"):
+        replace(volume, affine=np.zeros((4, 4)))
+    with pytest.raises(ValueError, match="unit: got 'um2/ms'; expected 'mm²/s' or nothing"):
+        replace(volume, unit="um2/ms")
     with pytest.raises(ValueError, match="no 2×2 tensors"):
         hj.io.save_tensors(tmp_path / "v.nii", volume.slice("z", 1))
     assert list(tmp_path.iterdir()) == []
@@ -431,13 +435,15 @@ def test_an_interrupt_leaves_nothing(tmp_path):
     assert not (tmp_path / "a").exists()
 
 
-def test_a_folder_replaces_its_own_files_only(tmp_path):
+def test_a_folder_replaces_its_own_files_only(tmp_path, monkeypatch):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "old").write_text("kept")
     (tmp_path / "out" / "file").write_text("replaced")
-    with atomic_folder(tmp_path / "out") as temporary:
+    monkeypatch.chdir(tmp_path / "out")
+    with atomic_folder(".") as temporary:
         (temporary / "file").write_text("new")
         assert (tmp_path / "out" / "file").read_text() == "replaced"
+        assert temporary.resolve().parent == tmp_path / "out"  # the parent may be on another drive
     assert {f.name: f.read_text() for f in (tmp_path / "out").iterdir()} == {"old": "kept", "file": "new"}
     assert [f.name for f in tmp_path.iterdir()] == ["out"]
     with pytest.raises(NotADirectoryError, match="got a file"), atomic_folder(tmp_path / "out" / "old"):
@@ -572,6 +578,7 @@ def test_results_come_back_as_they_were_saved(tmp_path, rng, times):
     affine = np.array([[0, -2.0, 0, 5], [2.0, 0, 0, -3], [0, 0, -3.0, 1], [0, 0, 0, 1]])
     tensors, mask = np.broadcast_to(np.diag([1.0, 2.0]), (6, 5, 2, 2)), rng.random((6, 5)) < 0.9
     about = {"order": "fit", "notes": ("fitted",), "source": "dwi.nii", "digest": "0f"}
+    about |= {"length_unit": "mm", "unit": "mm²/s"}
     volume = TensorVolume(tensors, (2.0, 3.0), (1.0, 0.0), mask, affine, 1, **about)
     values = np.where(mask, rng.random((max(times.size, 1), 6, 5)), np.nan)
     settings = {"metric": "inverse", "normalisation": "flat", "boundary": (("neumann", "mean"), "periodic")}
@@ -585,7 +592,9 @@ def test_results_come_back_as_they_were_saved(tmp_path, rng, times):
     for name in ("tensors", "mask", "affine", "spacing", "origin", "slice_axis", *about):
         np.testing.assert_array_equal(getattr(read.volume, name), getattr(volume, name))
     assert tuples(read.settings["boundary"]) == settings["boundary"]
-    assert read.unit == "s"
+    assert (read.unit, read.length_unit) == ("s", "mm")
+    bare = replace(volume, length_unit="", unit="")  # an affine alone, such as of VTK's files, declares no unit
+    assert (replace(result, place=bare).unit, replace(result, place=bare).length_unit) == ("", "")
     if times.size:
         assert repr(read) == f"Result(hks: float64 (2, 6, 5), 2 times 1 … 2.5 s, source='{tmp_path / 'hks.npz'}')"
         np.testing.assert_allclose(read.z, (values - 1) / (0.1 + values))

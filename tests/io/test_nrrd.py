@@ -267,5 +267,5 @@ def test_masks_and_labels(tmp_path, volume):
     np.testing.assert_array_equal(read_labels(tmp_path / "labels.nrrd", volume.slice("y", 2)), labels[:, 2])
     header["space origin"] = ORIGIN
     nrrd.write(str(tmp_path / "m.nrrd"), volume.mask.astype(np.uint8), header, index_order="F")
-    with pytest.raises(ValueError, match="the mask's affine displaces it"):
+    with pytest.raises(ValueError, match="the affine displaces this image"):
         read_mask(tmp_path / "m.nrrd", volume.affine)

@@ -114,8 +114,10 @@ def test_bad_repairs(volume):
     with pytest.raises(ValueError, match="floor: got -1; expected a finite number above 0"):
         repair_tensors(volume, "clip", -1)
     hopeless = TensorVolume(-volume.tensors, (1.0, 1.0), (0.0, 0.0), volume.mask & (np.indices(SHAPE)[0] > 4))
-    with pytest.raises(ValueError, match=r"none of the 27 tensors is positive definite\. Check the order"):
+    with pytest.raises(ValueError, match=r"all 27 tensors are not positive definite\. Noise does not explain"):
         repair_tensors(hopeless, "clip")
+    with pytest.raises(ValueError, match=r"all 63 tensors have an eigenvalue below 1\. Choose a lower floor"):
+        repair_tensors(volume, "clip", 1)
 
 
 def test_the_command_line_refuses(tmp_path, volume, capsys):

@@ -70,7 +70,7 @@ def test_masks_and_labels_that_lost_the_unit_lie_where_the_tensors_do(tmp_path):
             read_labels(tmp_path / "m.nii", twice)
     image.header.set_xyzt_units("meter")
     nib.save(image, tmp_path / "m.nii")
-    with pytest.raises(ValueError, match="the mask's affine displaces it"):
+    with pytest.raises(ValueError, match="the affine displaces this image"):
         read_mask(tmp_path / "m.nii", read.affine)
 
 
@@ -86,7 +86,7 @@ def test_labels_in_two_dimensions_lie_in_the_plane_of_the_slice(tmp_path, axis):
         with pytest.raises(ValueError, match="put the labels and the image on different voxels"):
             read_labels(tmp_path / "m.nii", on)
     nib.save(nib.Nifti1Image((values > 3).astype(np.uint8), affine), tmp_path / "m.nii")
-    with pytest.raises(ValueError, match="the mask's affine displaces it"):
+    with pytest.raises(ValueError, match="the affine displaces this image"):
         read_mask(tmp_path / "m.nii", read.affine)
 
 
@@ -223,5 +223,6 @@ def test_a_mesh_has_none_of_these_options(tmp_path, capsys, option):
     ("largest", "unit"), [(1e9, "m2/s"), (1.0, "um2/ms"), (3.0, "um2/ms"), (1000.0, None), (30.0, None), (6e4, None)]
 )
 def test_b_values_in_another_unit(largest, unit):
-    question = b_value_question(largest)
+    question = b_value_question(largest, "mm2/s")
     assert (f'pass unit "{unit}"' in question) if unit else question == ""
+    assert f'pass unit "{unit or "mm2/s"}"' in b_value_question(largest, "cm2/s" if unit else "um2/s")

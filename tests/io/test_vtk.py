@@ -77,6 +77,7 @@ def test_rotated_and_flipped_axes(tmp_path, tensors, count, binary):
         point = [0.0] * 3
         data.TransformIndexToPhysicalPoint(index, point)
         np.testing.assert_allclose((read.affine @ [*index, 1])[:3], point)
+    assert "right, anterior and superior" in read.notes[-1]
 
 
 @pytest.mark.parametrize("count", [6, 9])

@@ -428,14 +428,15 @@ def test_slices_of_a_volume(browser, tmp_path):
 def test_a_surface_is_turned_and_its_vertices_are_chosen(browser, tmp_path):
     browser.problems.clear()
     sphere = hj.examples.sphere_mesh(6)
-    vertices = np.asarray(sphere.vertices)
+    vertices = np.concatenate([np.zeros((3, 3)), sphere.vertices])  # three vertices are outside the domain
     flat = 1 + 0.3 * np.sin(np.outer(TIMES, vertices[:, 0]) + vertices[:, 2])
+    flat[:, :3] = np.nan
     np.savez(
         tmp_path / "hks.npz",
         hks=flat / (4 * np.pi * TIMES[:, None]),
         times=TIMES,
         vertices=vertices,
-        faces=sphere.faces,
+        faces=np.asarray(sphere.faces) + 3,
     )
     assert main(["explore", str(tmp_path), "-q"]) == 0
     browser.open(tmp_path / "explore.html")

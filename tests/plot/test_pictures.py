@@ -203,6 +203,25 @@ def test_influence_lines_are_where_the_influence_is():
     plot.influence_map(ax, 0 * x, grid)  # no line, no warning
 
 
+def test_what_is_drawn_over_an_oriented_image_is_oriented_too():
+    upwards = plot.Orientation.of(np.array([[0, -1, 0, 20], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]), 2)
+    grid = hj.Grid((21, 11))
+    x, y = np.moveaxis(grid.nodes, -1, 0)
+    ax = axes()
+    plot.influence_map(ax, x / 20, grid, levels=(0.5,), orientation=upwards)  # x of the array points upwards
+    (lines,) = [c for c in ax.collections if hasattr(c, "levels")]
+    np.testing.assert_allclose(lines.get_paths()[0].vertices[:, 1], 10)
+    direction = np.stack([1 + 0.1 * x, y - 4], axis=-1)
+    field = hj.TensorField(grid, np.eye(2) + direction[..., None] * direction[..., None, :])
+    turned = hj.TensorField(upwards.grid(grid), upwards.tensors(field.tensors))
+    images = [
+        plot.line_integral_convolution(axes(), shown, values=shown.tensors[..., 0, 0], **more)
+        for shown, more in ((field, {"orientation": upwards}), (turned, {}))
+    ]
+    assert images[0].get_extent() == images[1].get_extent()
+    np.testing.assert_array_equal(*(image.get_array() for image in images))
+
+
 # --- at any size --------------------------------------------------------------------------------------------
 
 

@@ -375,6 +375,13 @@ def test_surface_colours_triangles_by_their_vertices():
     assert mappable.get_clim() == (0.0, 3.0)
     with pytest.raises(ValueError, match=r"values: got shape \(3,\); expected \(4,\)"):
         surface(ax, SurfaceMesh(vertices, faces), values[:3])
+    # Vertices outside a mask have neither values nor, perhaps, coordinates.
+    part = SurfaceMesh(
+        np.append(vertices, [[np.nan] * 3], axis=0), np.append(faces, [[0, 1, 4]], axis=0), mask=[True] * 4 + [False]
+    )
+    ax = new_figure(3, 3).add_subplot(projection="3d")
+    assert surface(ax, part, np.append(values, np.nan)).get_clim() == (0.0, 3.0)
+    assert np.isfinite(ax.get_xlim()).all()
 
 
 def test_a_solid_is_drawn_by_its_boundary():

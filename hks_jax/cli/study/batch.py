@@ -41,7 +41,7 @@ import numpy as np
 
 from hks_jax.cli.info import describe
 from hks_jax.cli.job import ComputationError, Settings
-from hks_jax.cli.noise import require_spectral, second_scan
+from hks_jax.cli.noise import check_noise, second_scan
 from hks_jax.cli.options import FILES, READING, SOLVING, defaults, flag, options_in, refuse
 from hks_jax.cli.outputs import Done, show
 from hks_jax.cli.progress import Progress, StudyProgress
@@ -90,9 +90,8 @@ def run(args: argparse.Namespace, begun: Progress) -> None:
     for subject in chosen:
         if subject.arguments is not None:
             require_metric(subject.arguments)
-            require_spectral(subject.arguments)
-    with_regions = any(s.arguments is not None and s.arguments.atlas is not None for s in subjects)
-    if not with_regions:
+            check_noise(subject.arguments)
+    if not any(s.arguments is not None and s.arguments.atlas is not None for s in subjects):
         refuse(args, ("names",), "this option names labels, which are missing; pass --atlas, or a column named atlas")
     progress = StudyProgress(len(chosen), args.quiet)
     progress.start = begun.start
@@ -105,7 +104,7 @@ def run(args: argparse.Namespace, begun: Progress) -> None:
             there = {s.name for s in subjects if problems.get(s.name) == "" and _is_there(study, s)}
             problems = {name: why for name, why in problems.items() if name not in there}
         problems |= _other_units(study, [subject for subject in subjects if subject.name not in problems])
-        files = study.write_group(subjects, problems, with_regions)
+        files = study.write_group(subjects, problems)
     failed = [subject.name for subject in chosen if problems.get(subject.name)]
     tables = "\n".join(str(file) for file in files if file.suffix == ".tsv")
     show(args, Done(files, {"failed": failed}, tables))

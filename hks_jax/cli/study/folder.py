@@ -168,21 +168,28 @@ class Study:
         rows = [(who, *map(first[who].get, covariates)) for who in dict.fromkeys(s.participant for s in subjects)]
         write_table(self.folder / "participants.tsv", ("participant_id", *covariates), rows)
 
-    def write_group(self, subjects: list[Subject], problems: Mapping[str, str], with_regions: bool) -> list[Path]:
-        """Write the tables of all subjects and all regions; `problems` maps names of failed subjects to reasons."""
+    def write_group(self, subjects: list[Subject], problems: Mapping[str, str]) -> list[Path]:
+        """Write the tables of all subjects and all regions; `problems` maps names of failed subjects to reasons.
+
+        The regions are those of all subjects that have a table of regions, which belongs to their signature.
+        """
         n = 1 + any(subject.session for subject in subjects)
         head, ids = ("participant_id", "session_id")[:n], {s.name: (s.participant, s.session)[:n] for s in subjects}
         summary = [(*ids[s.name], *_summary(self.path(s, f"{MAP}.json"), problems.get(s.name))) for s in subjects]
         about = {name: {"Description": text} for name, text in SUMMARY.items()}
         files = write_table(self.folder / "group_summary.tsv", (*head, *SUMMARY), summary, about)
         done = [s for s in subjects if s.name not in problems and self.path(s, f"{REGIONS}.json").is_file()]
-        if with_regions and done:
+        joint = self.folder / "group_regions.tsv"
+        if not done:
+            for old in (joint.with_suffix(".json"), joint):
+                old.unlink(missing_ok=True)
+        else:
             tables = [(ids[subject.name], read_table(self.path(subject, f"{REGIONS}.tsv"))) for subject in done]
             columns = list(dict.fromkeys(name for _, rows in tables for row in rows for name in row))
             joined = [(*who, *map(row.get, columns)) for who, rows in tables for row in rows]
             about = read_json(self.path(done[0], f"{REGIONS}.json"))
             described = {name: about[name] for name in (*columns, "Settings") if name in about}
-            files += write_table(self.folder / "group_regions.tsv", (*head, *columns), joined, described)
+            files += write_table(joint, (*head, *columns), joined, described)
         return files
 
 

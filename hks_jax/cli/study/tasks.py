@@ -14,7 +14,7 @@ import numpy as np
 
 from hks_jax.cli import INPUT_ERRORS
 from hks_jax.cli.job import ComputationError, Solved, compute_pairs
-from hks_jax.cli.noise import signature_of
+from hks_jax.cli.noise import noise_of_volume, signature_of
 from hks_jax.cli.pairs import are_of, read_pairs, write_pairs
 from hks_jax.cli.progress import StudyProgress
 from hks_jax.cli.reading import read_volume
@@ -136,7 +136,8 @@ def _compute(study: Study, subject: Subject, fingerprint: str, progress: StudyPr
     if args.noise == "residuals" and solved.volume.covariance is None:  # covariances are not saved with eigenpairs
         volume = read_volume(args, StudyProgress(1, quiet=True, stream=io.StringIO()))
         solved = solved._replace(volume=volume.with_mask(solved.volume.mask))
-    result = signature_of(args, solved, progress)
+    noise = noise_of_volume(args, solved.volume, solved.field.grid, progress)
+    result = signature_of(args, solved, noise, progress)
     result = replace(result, arrays={**scaled, **result.arrays})
     drawing = partial(signature_panels, result, view=args.view)
     with progress.stage("writing"):

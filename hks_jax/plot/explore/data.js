@@ -12,6 +12,7 @@ function bytes(id) {
 }
 
 const floats = (id) => new Float32Array(bytes(id).buffer);
+const integers = (id) => new Int32Array(bytes(id).buffer);
 
 const shape = [...about.shape, 1, 1].slice(0, 3);
 const dimension = about.dimension;
@@ -20,7 +21,7 @@ const inside = bytes("inside");
 const values = floats("values"); // for each time, at the inside nodes in the order of the grid
 const deviations = about.noise ? floats("deviation") : null; // the standard deviations of the values due to noise
 const layers = about.layers.map((layer, i) => ({ ...layer, values: floats(`layer-${i}`) }));
-const labels = about.labels.length ? new Int32Array(bytes("labels").buffer) : null;
+const labels = about.labels.length ? integers("labels") : null;
 
 // Maps between positions in the grid, flat = (i·ny + j)·nz + k, and the numbers of inside nodes.
 const nodeOfPlace = new Int32Array(inside.length).fill(-1);
@@ -41,7 +42,8 @@ function placeAt(node) {
   return [Math.floor(ij / shape[1]), ij % shape[1], k];
 }
 
-const voxel = (place) => about.offset.map((o, a) => o + place[a]);
+// The indices of a node in the volume, or the number of a vertex in the mesh; the page has only vertices inside.
+const voxel = (place) => (surface ? [surface.numbers[place[0]]] : about.offset.map((o, a) => o + place[a]));
 
 function position(place) {
   if (surface) return [...surface.vertices.subarray(3 * place[0], 3 * place[0] + 3)];

@@ -90,9 +90,12 @@ def explore(
     inside = np.isfinite(result.values).all(axis=0)
     surface, place = {}, {}
     if isinstance(mesh, SurfaceMesh):
-        if not inside.all():
+        used = mesh.triangulation.used
+        if not inside[used].all():
             raise ValueError("values: got NaN or infinite values on a surface; expected finite values")
-        surface = {"vertices": _base64(mesh.vertices, "<f4"), "faces": _base64(mesh.faces, "<i4")}
+        inside, renumbered = used, np.cumsum(used) - 1
+        surface = {"faces": _base64(renumbered[mesh.faces], "<i4"), "numbers": _base64(np.flatnonzero(used), "<i4")}
+        surface["vertices"] = _base64(np.asarray(mesh.vertices)[used], "<f4")
     else:
         inside &= result.volume.inside
         place = {"spacing": result.volume.spacing, "origin": result.volume.origin}
@@ -115,7 +118,8 @@ def explore(
     if noise is not None:
         shown["deviation"] = (scale * noise)[:, inside]
     box = bounding_box(inside, margin=0)
-    numbers = {"inside": _base64(inside[box], "u1")}
+    shown_inside = inside[inside] if surface else inside[box]
+    numbers = {"inside": _base64(shown_inside, "u1")}
     numbers |= {name: _base64(array, "<f4") for name, array in shown.items()}
     numbers |= {f"layer-{i}": _base64(array, "<f4") for i, array in enumerate(layers.values())}
     names: dict[int, str] = {}
@@ -127,7 +131,7 @@ def explore(
         "software": f"hks-jax {__version__}",
         "dimension": result.dimension,
         "mesh": bool(surface),
-        "shape": inside[box].shape,
+        "shape": shown_inside.shape,
         "offset": [part.start for part in box],
         **place,
         **_in_space(result),
@@ -138,7 +142,7 @@ def explore(
         "flat": result.flat_scale.ravel().tolist(),
         "normalisation": result.normalisation,
         "noise": noise is not None,
-        "start": [0] if surface else middle_node(inside[box]),
+        "start": [0] if surface else middle_node(shown_inside),
         "layers": [
             {"name": name, "kind": "scalar" if array.ndim == 1 else "direction"} for name, array in layers.items()
         ],
@@ -149,7 +153,7 @@ def explore(
     }
     page = _assemble(about, numbers | surface)
     with atomic_path(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+        temporary.write_text(page, encoding="utf-8", errors="replace")  # the title may be a file name
     return Path(path)
 
 
