@@ -158,19 +158,20 @@ def observe(target: Any, times: Any, data: Data, space: FunctionSpace, dtype: An
         wanted = "(m,), the lowest eigenvalues in ascending order" if expected is None else f"{what} = {expected}"
         raise ValueError(f"target: got shape {values.shape}; expected {wanted}")
 
-    weights, noise = _weights(values, data)
-    weights = weights * (space.free if signature.at_nodes else 1)
+    given = np.ones(values.shape) if data.weights is None else _broadcast("weights", data.weights, values.shape)
+    if not (np.isfinite(given) & (given >= 0)).all():
+        raise ValueError("weights: got negative, infinite or NaN weights; expected numbers ≥ 0 (0: not observed)")
+    used = (given > 0) & (space.free if signature.at_nodes else True)
     if signature.lowest:
-        weights = weights * (np.arange(values.size) >= space.n_null)  # constants have the eigenvalue 0 for every metric
-    used = weights > 0
+        used &= np.arange(values.size) >= space.n_null  # constants have the eigenvalue 0 for every metric
     if not used.any():
         raise ValueError("weights: got only zeros inside the domain; expected a positive weight at some entry")
     remedy = "Correct the invalid values, give them the weight 0, or remove their nodes from the mask"
     _refuse("target", values, used & ~np.isfinite(values), used, "NaN or infinite", remedy)
     if data.loss in ("log", "relative"):
         _refuse("target", values, used & (values <= 0), used, "not positive", remedy)
+    share, noise = _weights(values, given, used, data)
     entries = np.flatnonzero(used)
-    share = weights.ravel()[entries]
     observation = Observation(
         target=jnp.asarray(values.ravel()[entries], dtype),
         root_weights=jnp.asarray(np.sqrt(share / share.sum()), dtype),
@@ -183,21 +184,18 @@ def observe(target: Any, times: Any, data: Data, space: FunctionSpace, dtype: An
     return observation, noise
 
 
-def _weights(values: np.ndarray, data: Data) -> tuple[np.ndarray, float | None]:
-    """Return the weights divided by the squared deviations, and the standard deviation of the residuals or None."""
-    given = np.ones(values.shape) if data.weights is None else _broadcast("weights", data.weights, values.shape)
-    if not (np.isfinite(given) & (given >= 0)).all():
-        raise ValueError("weights: got negative, infinite or NaN weights; expected numbers ≥ 0 (0: not observed)")
+def _weights(
+    values: np.ndarray, given: np.ndarray, used: np.ndarray, data: Data
+) -> tuple[Float[np.ndarray, " m"], float | None]:
+    """Return the used weights divided by the squared deviations, and the residuals' standard deviation or None."""
+    given, noise = given[used], data.noise
     if data.deviation is None:
-        return given, data.noise
+        return given, noise
     size = _broadcast("deviation", data.deviation, values.shape)
-    used = (given > 0) & np.isfinite(values)
     remedy = "Expected a positive number for every observed value; set the weight of other values to 0"
     _refuse("deviation", size, used & ~(np.isfinite(size) & (size > 0)), used, "not positive numbers", remedy)
-    of_residuals = np.where(used, size if data.loss == "absolute" else size / np.abs(values), 1.0)
-    weighed = np.where(used, given / of_residuals**2, 0.0)
-    stated = float(np.sqrt(np.sum(given, where=used) / np.sum(weighed)))
-    return weighed, stated if data.noise is None else data.noise
+    weights = given / (size[used] / (1 if data.loss == "absolute" else values[used])) ** 2
+    return weights, float(np.sqrt(given.sum() / weights.sum())) if noise is None else noise
 
 
 def _broadcast(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:

@@ -96,7 +96,8 @@ def hks(
         method: ``"spectral"`` sums over the pairs. ``"spectrum-free"`` uses only the matrices of the pairs (see
             `hks_spectrum_free`). ``"auto"`` sums over the pairs at times at which the sum is accurate to the tolerance,
             and uses the matrices at the other times; `hks_auto` also reports its choice.
-        tolerance: the allowed error of ``"spectrum-free"`` and ``"auto"``, relative to (4πt)^(−d/2).
+        tolerance: the allowed error of ``"spectrum-free"`` and ``"auto"``, relative to (4πt)^(−d/2), with the factor of
+            `hks_spectrum_free` for a potential.
 
     Raises:
         ValueError: if times are not positive and finite, if the normalisation or the method is unknown, if
@@ -138,7 +139,7 @@ def hks_auto(
 
     Args:
         times: (n_times,) positive; the normalisation is as in `hks`.
-        tolerance: the allowed error of both methods, relative to (4πt)^(−d/2).
+        tolerance: the allowed error of both methods, as in `hks`.
 
     Raises:
         ValueError: as in `hks`, or if values are traced, because the choice depends on them.
@@ -213,7 +214,7 @@ def _difference(pairs: Eigenpairs, times: Float[Array, " 1"], tolerance: float, 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AccuracyWarning)
         spectral = hks(pairs, times)
-    other = hks_spectrum_free(pencil, times, method=settings or "selected-inversion", tolerance=tolerance)
+        other = hks_spectrum_free(pencil, times, method=settings or "selected-inversion", tolerance=tolerance)
     return jnp.nanmax(jnp.abs(spectral - other)) * (4 * math.pi * times[0]) ** (pairs.space.dimension / 2)
 
 

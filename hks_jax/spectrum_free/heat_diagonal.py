@@ -7,10 +7,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.arrays import nan_is_meant, nan_outside
 from hks_jax.checks import checked_times, require_number
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
+from hks_jax.eigen.quality import largest
 from hks_jax.fem.assembly import MassKind
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.nodal import nodal_pencil
@@ -24,6 +26,12 @@ from hks_jax.spectrum_free.plan import Method, choose_method, plan, require_grid
 from hks_jax.spectrum_free.probing import coloured_diagonal
 from hks_jax.spectrum_free.rational import selected_inversion
 from hks_jax.spectrum_free.spectrum_bounds import bounds, mass_bound
+from hks_jax.traced import is_traced
+
+_ROUNDING = 1e-13
+"""The error of the rational approximation of the exponential in double precision."""
+_LATE = 0.3
+"""The largest product ελt at which selected inversion is used."""
 
 
 @nan_is_meant
@@ -41,7 +49,8 @@ def hks_spectrum_free(
     colouring grows with t/h², whereas the cost of eigenpairs falls; selected inversion costs the same at any t.
     docs/spectrum-free.md derives the bounds. The unit is 1/(metric length)^d. Values are NaN outside the mask, and 0 at
     Dirichlet nodes. All values are NaN if times or the largest eigenvalue exceed those for which a given `Colouring`
-    was made.
+    was made. Values at large times are NaN if rounding errors may exceed a few per cent: with selected inversion in
+    float32, or if a potential's least value is far below the lowest eigenvalue.
 
     Args:
         domain: a tensor field on a grid, a mesh of triangles or tetrahedra, or a pencil of either from `assemble`.
@@ -64,6 +73,9 @@ def hks_spectrum_free(
             without a given `Colouring`.
         TypeError: colouring on a mesh.
 
+    Warns:
+        AccuracyWarning: rounding errors make concrete values NaN.
+
     Examples:
         >>> np.allclose(hj.hks_spectrum_free(field, [0.5]), hj.hks(pairs, [0.5]), atol=1e-4)
         True
@@ -75,7 +87,7 @@ def hks_spectrum_free(
     scale, given = jnp.exp(-origin * times), isinstance(method, Colouring)
     values = [_diagonal(part, times, settings, scale, checked=given) for part in pencil.parts]
     # The mean over even and odd parts is the signature: a point source is half the sum of an even and an odd function.
-    return jnp.mean(jnp.stack(values), axis=0)
+    return _nan_if_lost(jnp.mean(jnp.stack(values), axis=0), pencil, times, settings, scale)
 
 
 def colouring(
@@ -110,6 +122,37 @@ def colouring(
     require_number("memory", memory)
     require_number("slack", slack, above=1, inclusive=True)
     return plan(pencil, times, tolerance, memory, slack)
+
+
+# With the rounding unit ε and the largest eigenvalue λ, selected inversion at a time t had a relative error of at most
+# ελt/10 in measurements. The error of the signature of K − vM is about `_ROUNDING` divided by the least mass for
+# selected inversion. For colouring it is at most a fiftieth of the bound in measurements. The scale exp(−vt) multiplies
+# this error.
+def _nan_if_lost(
+    values: Float[Array, "m *shape"],
+    pencil: AnyPencil,
+    times: Float[Array, " m"],
+    settings: Colouring | None,
+    scale: Float[Array, " m"],
+) -> Float[Array, "m *shape"]:
+    """Return the signature, with NaN at times at which errors may exceed a few per cent of the largest value."""
+    known, parts, times, scale = jax.lax.stop_gradient((values, pencil.parts, times, scale))
+    if settings is None:
+        eps, least = float(jnp.finfo(times.dtype).eps), jnp.stack([jnp.min(part.mass.diagonal()) for part in parts])
+        error = max(_ROUNDING, 10 * eps) / jnp.min(least)
+        late = eps * times * jnp.max(jnp.stack([largest(part) for part in parts])) > _LATE
+    else:
+        error = max(settings.error) / 50 * (4 * jnp.pi * times) ** (-len(settings.spacing) / 2)
+        late = jnp.zeros(times.shape, bool)
+    most = jnp.max(jnp.where(jnp.isnan(known), 0, jnp.abs(known)).reshape(times.size, -1), axis=1)
+    lost = late | (scale > 1) & ~(error * scale <= 0.01 * most)
+    if not is_traced(lost) and lost.any():
+        warn_of_accuracy(
+            f"times: the signatures at {int(lost.sum())} of {times.size} times, the first {float(times[lost][0]):.4g}, "
+            f"are NaN, because rounding errors in {times.dtype} grow with t, in particular with a potential whose "
+            "least value is far below the lowest eigenvalue. Use eigenpairs or smaller times"
+        )
+    return values * jnp.where(lost, jnp.nan, 1).astype(values.dtype).reshape(-1, *[1] * (values.ndim - 1))
 
 
 def _read_as_unknowns(pencil: AnyPencil) -> AnyPencil:

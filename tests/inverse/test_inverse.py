@@ -391,6 +391,20 @@ def test_deviation_bounds_that_of_the_exact_posterior():
     assert (few.deviation < 0.5).all()
 
 
+def test_entries_that_no_metric_changes_do_not_count_in_the_noise():
+    """Signatures at Dirichlet nodes and the eigenvalues of null vectors are zero for every metric."""
+    field = hj.TensorField(hj.Grid((6, 6), 0.2), np.tile(np.eye(2), (6, 6, 1, 1)))
+    zero, free = hj.eigenpairs(field, 16, "dirichlet"), hj.eigenpairs(field, 4)
+    for pairs, target, times, kind in (
+        (zero, hj.hks(zero, [0.05, 0.1]), [0.05, 0.1], "hks"),
+        (free, free.eigenvalues, None, "eigenvalues"),
+    ):
+        observation, noise = observe(target, times, Data(kind, deviation=0.02), pairs.space, float)
+        positive = np.asarray(target)[np.asarray(target) > 0]
+        assert noise == pytest.approx(np.mean((positive / 0.02) ** 2) ** -0.5)
+        np.testing.assert_allclose(observation.root_weights, positive / np.linalg.norm(positive))
+
+
 @pytest.mark.slow
 def test_error_bars_of_a_fit_are_those_of_its_posterior():
     """The covariance is (JᵀΣ⁻¹J + R)⁻¹, with the penalties' and the white prior's R."""

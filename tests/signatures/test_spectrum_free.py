@@ -243,6 +243,32 @@ def test_traced_values_need_settings_and_settings_must_fit():
         jax.grad(jax.grad(lambda s: loss(s, method=settings)))(1.0)
 
 
+@pytest.mark.parametrize("method", ["selected-inversion", "colouring"])
+def test_amplified_errors_give_nan(method):
+    """Errors grow as exp(−vt) with the least potential v; for a constant potential the signature grows as fast."""
+    field = flat((8, 7), (1.4, 1.2))
+    well = hj.assemble(field, potential=np.where(np.arange(56) == 25, -60.0, 0.0).reshape(8, 7), mass="lumped")
+    pairs = hj.eigenpairs(well, 56, solver="dense")
+    assert abs(pairs.eigenvalues[0]) < 10
+    times = [0.05, 1.0]
+    with pytest.warns(hj.AccuracyWarning, match="the signatures at 1 of 2 times, the first 1, are NaN"):
+        found = hj.hks_spectrum_free(well, times, method=method)
+    np.testing.assert_allclose(found[0], hj.hks(pairs, times)[0], rtol=1e-3)
+    assert np.isnan(found[1]).all()
+    if method == "selected-inversion":
+        traced = jax.jit(lambda t: hj.hks_spectrum_free(well, t, method=method))(jnp.array(times))
+        np.testing.assert_allclose(traced, found, rtol=1e-9)
+    if method == "selected-inversion":
+        single = hj.TensorField(field.grid, field.tensors.astype(np.float32))
+        with pytest.warns(hj.AccuracyWarning, match="at 1 of 2 times, the first 1e\\+06, are NaN, because .* float32"):
+            found = hj.hks_spectrum_free(single, [10.0, 1e6], method=method)
+        np.testing.assert_allclose(found[0], 1 / 1.68, rtol=1e-3)
+        assert np.isnan(found[1]).all()
+    deep = hj.assemble(field, potential=-60.0, mass="lumped")
+    growing = hj.hks_spectrum_free(deep, times, method=method)
+    np.testing.assert_allclose(growing, hj.hks(hj.eigenpairs(deep, 56, solver="dense"), times), rtol=1e-3)
+
+
 @pytest.mark.slow
 def test_float32():
     shape, times = (24, 22), [0.005, 0.01]
