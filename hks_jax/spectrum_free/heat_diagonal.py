@@ -47,8 +47,8 @@ def hks_spectrum_free(
 
     The result equals the signature of all eigenpairs of the discretisation, at any t. For node spacing h, the cost of
     colouring grows with t/h², whereas the cost of eigenpairs falls; selected inversion costs the same at any t.
-    docs/spectrum-free.md derives the bounds. The unit is 1/(metric length)^d. Values are NaN outside the mask, and 0 at
-    Dirichlet nodes. All values are NaN if times or the largest eigenvalue exceed those for which a given `Colouring`
+    docs/spectrum-free.md describes the bounds. The unit is 1/(metric length)^d. Values are NaN outside the mask, and 0
+    at Dirichlet nodes. All values are NaN if times or the largest eigenvalue exceed those for which a given `Colouring`
     was made. Values at large times are NaN if rounding errors may exceed a few per cent: with selected inversion in
     float32, or if a potential's least value is far below the lowest eigenvalue.
 
