@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import os
+import re
 from typing import Any
 
 import jax
@@ -23,11 +24,13 @@ class Checkpoint:
     step_size: float  # the divisor of the Gauss–Newton damping
     best: Any  # the unknowns of the best fit from an earlier initial guess
     losses: list[float]  # the final loss for each earlier initial guess
+    ended: str = "interrupted"  # how the best fit ended
 
 
 def fingerprint(*parts: Any) -> str:
-    """Return a hash of arrays, settings and names of functions, which is the same in every process."""
-    digest = hashlib.blake2b(digest_size=16)
+    """Return a hash of arrays, grids, settings and names of functions, which is the same in every process."""
+    structure = re.sub(r" at 0x\w+", "", str(jax.tree.structure(parts)))  # without the addresses of functions
+    digest = hashlib.blake2b(structure.encode(), digest_size=16)
     for leaf in jax.tree.leaves(parts):
         text = getattr(leaf, "__qualname__", repr(leaf)).encode()
         digest.update(np.asarray(leaf).tobytes() if hasattr(leaf, "dtype") else text)
@@ -59,4 +62,5 @@ def load(path: str | os.PathLike[str], mark: str) -> Checkpoint:
         )
     history = [Step(*row) for row in data["history"].tolist()]
     start, stage, step_size = (data[name].item() for name in ("start", "stage", "step_size"))
-    return Checkpoint(data["values"], history, start, stage, step_size, data["best"], data["losses"].tolist())
+    losses, ended = data["losses"].tolist(), str(data["ended"])
+    return Checkpoint(data["values"], history, start, stage, step_size, data["best"], losses, ended)

@@ -20,7 +20,7 @@ from hks_jax.inverse.observation import Data, Observation, observe
 from hks_jax.inverse.problem import Problem, more_pairs, truncation_shows
 from hks_jax.inverse.regulariser import Regulariser
 from hks_jax.inverse.search import Run, Search, choose_inner_product
-from hks_jax.inverse.unknowns import Free, Nodal, Parametrisation, flat_field, unknowns_for
+from hks_jax.inverse.unknowns import Free, Parametrisation, flat_field, unknowns_for
 
 
 def fit_metric(
@@ -99,8 +99,7 @@ def fit_metric(
     problems = [problem_of(each, each.pairs_needed(k, pencil, init)) for each in observed.stages(search.continuation)]
     first, inner_product = unknowns.start(), choose_inner_product(unknowns, search.smoothness, noise)
     settings = {**vars(data), **vars(search), "max_steps": None}
-    kind = unknowns.parametrisation.tensors if isinstance(unknowns, Nodal) else None
-    mark = files.fingerprint(observed, unknowns, kind, regularisers, settings, repr((k, boundary)))
+    mark = files.fingerprint(observed, unknowns, regularisers, settings, repr((k, boundary)))
     now = files.Checkpoint(first, [], 0, 0, 1.0, first, [])
     if checkpoint is not None and Path(checkpoint).exists():
         now = files.load(checkpoint, mark)

@@ -109,7 +109,7 @@ def optimise(
             new = seen is None or bool(jnp.any(outcome.values != seen))
             if new or isinstance(optimiser, GaussNewton):
                 seen, loss, misfit = outcome.values, float(outcome.loss), float(outcome.misfit)
-                gradient = float(outcome.gradient) / np.sqrt(len(values))
+                gradient = float(outcome.gradient) / len(values)
                 if not np.isfinite(loss):
                     return best._replace(result="not finite")
                 if loss <= least:

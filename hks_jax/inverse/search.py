@@ -158,19 +158,19 @@ class Run:
         now, start = self.now, self.now.start
         where = jnp.asarray(now.values), now.stage, now.step_size
         if now.stage == len(problems):  # all initial guesses were tried before the fit was interrupted
-            return Reached(where[0], None, "converged")
-        best = Reached(jnp.asarray(now.best), None, "interrupted")
+            return Reached(where[0], None, now.ended)
+        best = Reached(jnp.asarray(now.best), None, now.ended)
         for now.start in range(start, self.search.starts):
             if now.start > start:
                 where = self._moved(now.start), 0, 1.0
             reached = self.through_stages(problems, *where)
             assert reached.outcome is not None
             loss = float(reached.outcome.loss)
-            if not now.losses or not loss >= min(now.losses):
-                best, now.best = reached, reached.values
+            if not now.losses or loss < np.fmin.reduce([np.inf, *now.losses]):  # ignores losses that are NaN
+                best, now.best, now.ended = reached, reached.values, reached.result
             now.losses.append(loss)
             if reached.result == "interrupted":
-                break
+                return best._replace(result="interrupted")
         now.stage, now.best = len(problems), best.values
         return best
 

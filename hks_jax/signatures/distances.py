@@ -18,7 +18,7 @@ from hks_jax.signatures.spectral_functions import (
     spectral_diagonal,
     spectral_squared_distances,
 )
-from hks_jax.signatures.times import dimension_of, positive_range, times_of, volume_of
+from hks_jax.signatures.times import dimension_of, positive_range, volume_of
 from hks_jax.signatures.truncation import resolved_times, truncation
 from hks_jax.traced import is_traced
 
@@ -38,7 +38,7 @@ def diffusion_distance(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Arr
         >>> print(jnp.isclose(d**2, k[0, 0, 0] - 2 * k[0, 8, 8] + k[1, 8, 8]))
         True
     """
-    return _distance(pairs, Heat(resolved_times(pairs, 2 * times_of(pairs, times))), sources)
+    return _distance(pairs, Heat(2 * resolved_times(pairs, times, 2)), sources)
 
 
 @nan_is_meant

@@ -1,5 +1,6 @@
 """Truncation and discretisation errors of heat kernel signatures at each time and each node."""
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -210,16 +211,18 @@ def _estimated(pairs: Eigenpairs, times: Any) -> tuple[Eigenpairs, Float[Array, 
     return jax.lax.stop_gradient((pairs, at))
 
 
-def resolved_times(pairs: Eigenpairs, times: Any) -> Float[Array, " n"]:
+def resolved_times(pairs: Eigenpairs, times: Any, factor: int = 1) -> Float[Array, " n"]:
     """Return times as `times_of` does; warn if the pairs or the node spacing do not resolve some of the times.
 
-    No warning is issued if values are traced, if pairs lie in an interval (their sums are band-limited on purpose), or
+    The eigenvalues of the caller's kernel are exp(−λt·factor). No warning is issued if values are traced, if pairs lie in an interval (their sums are band-limited on purpose), or
     if the dimension of the manifold is not known.
     """
     times = times_of(pairs, times)
     known, at = jax.lax.stop_gradient((pairs, times))
     if not is_traced((known.eigenvalues, known.pencil, at)) and pairs.lowest and pairs.space.dimension is not None:
-        for message in truncation(known, at).messages():
+        estimate = truncation(known, factor * at)
+        of_caller = dataclasses.replace(estimate, times=at, smallest_time=estimate.smallest_time / factor)
+        for message in of_caller.messages():
             warn_of_accuracy(message)
     return times
 

@@ -360,6 +360,39 @@ def test_checkpoints_resume_where_a_fit_was_interrupted(tmp_path):
         hj.fit_metric(FLAT, target, TIMES, "conformal", k=K, checkpoint=tmp_path / "notes.txt")
 
 
+def test_a_search_from_several_starts_keeps_its_best_fit_and_how_it_ended(tmp_path):
+    grid = hj.Grid((5, 5), 0.25)
+    flat = hj.TensorField(grid, np.tile(np.eye(2), (5, 5, 1, 1)))
+    target = 1.3**-1 * np.asarray(hj.eigenpairs(flat, 4).eigenvalues)
+    data, search = Data(signature="eigenvalues"), Search(starts=3, spread=0.2, seed=0, max_steps=8)
+
+    def scaled(s):  # the initial guesses are 1, 0.8 and 1.2
+        return jnp.where(s > 0.95, s, jnp.nan) * jnp.tile(jnp.eye(2), (5, 5, 1, 1))
+
+    def fit(init=flat, **options):
+        options = {"data": data, "search": search, "checkpoint": tmp_path / "fit.npz"} | options
+        return hj.fit_metric(init, target, None, Free(scaled, jnp.array(1.0)), **options)
+
+    def interrupt(step):
+        if step.start == 2 and step.step == 1:
+            raise KeyboardInterrupt
+
+    prior = LogDeterminant(1e-9, flat)
+    stopped = fit(progress=interrupt, regularisers=[prior])
+    assert np.isnan(stopped.losses[1])
+    assert stopped.result == "interrupted"
+    again = fit(regularisers=[prior])
+    assert again.converged
+    assert again.loss == np.nanmin(again.losses)
+    np.testing.assert_allclose(again.values, 1.3, rtol=1e-4)
+    gradient = jax.grad(lambda v: sum(jnp.sum(r**2) for r in again.problem.residuals(v)) / 2)(jnp.array([1.0]))
+    np.testing.assert_allclose(again.history[0].gradient, jnp.linalg.norm(gradient), rtol=1e-6)
+    wider = hj.TensorField(hj.Grid((5, 5), 0.5), flat.tensors)
+    for other in ({"regularisers": [Prior(1e-9, flat)]}, {"regularisers": [prior], "init": wider}):
+        with pytest.raises(ValueError, match="belongs to another fit"):
+            fit(**other)
+
+
 @pytest.mark.slow
 def test_continuation_and_several_starts():
     fit = hj.fit_metric(

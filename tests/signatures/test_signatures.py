@@ -314,6 +314,10 @@ def test_too_small_times_are_reported():
     assert 0.095 < hj.truncation(whole, [least]).resolution_bias[0] < 0.105
     smallest = hj.truncation(pairs, [0.5]).smallest_time
     assert hj.truncation(pairs, smallest[None]).tail[0] < 0.011
+    # The diffusion distance at t contains the kernel at 2t.
+    half = f"t = 0.002 lies .* at least about {smallest / 2:.4g}"
+    with pytest.warns(hj.AccuracyWarning, match=half):
+        hj.diffusion_distance(pairs, [0.002], (3, 4))
 
 
 @pytest.mark.parametrize(
