@@ -47,12 +47,14 @@ def require_real(name: str, values: Any) -> None:
 
 
 def real_array(name: str, values: Any) -> Array:
-    """Return values as a JAX array of floating-point numbers, after the checks of `require_real`."""
+    """Return values as a JAX array of at least single precision, after the checks of `require_real`."""
     require_real(name, values)
     if isinstance(values, np.ndarray):
         values = values.astype(values.dtype.newbyteorder("="), copy=False)
     array = jax_array(values)
-    return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(jnp.result_type(float))
+    if not jnp.issubdtype(array.dtype, jnp.floating):
+        return array.astype(jnp.result_type(float))
+    return array.astype(jnp.float32) if array.dtype.itemsize < 4 else array
 
 
 def require_count(name: str, value: Any, least: int = 1) -> None:

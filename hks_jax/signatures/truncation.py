@@ -214,8 +214,8 @@ def _estimated(pairs: Eigenpairs, times: Any) -> tuple[Eigenpairs, Float[Array, 
 def resolved_times(pairs: Eigenpairs, times: Any, factor: int = 1) -> Float[Array, " n"]:
     """Return times as `times_of` does; warn if the pairs or the node spacing do not resolve some of the times.
 
-    The eigenvalues of the caller's kernel are exp(−λt·factor). No warning is issued if values are traced, if pairs lie in an interval (their sums are band-limited on purpose), or
-    if the dimension of the manifold is not known.
+    The factor is 2 if the caller computes exp(−2λt). No warning is issued if values are traced, if pairs lie in an
+    interval (their sums are band-limited on purpose), or if the dimension of the manifold is not known.
     """
     times = times_of(pairs, times)
     known, at = jax.lax.stop_gradient((pairs, times))

@@ -49,8 +49,8 @@ def hks_spectrum_free(
     colouring grows with t/h², whereas the cost of eigenpairs falls; selected inversion costs the same at any t.
     docs/spectrum-free.md describes the bounds. The unit is 1/(metric length)^d. Values are NaN outside the mask, and 0
     at Dirichlet nodes. All values are NaN if times or the largest eigenvalue exceed those for which a given `Colouring`
-    was made. Values at large times are NaN if rounding errors may exceed a few per cent: with selected inversion in
-    float32, or if a potential's least value is far below the lowest eigenvalue.
+    was made. Values at large times are NaN if errors may exceed a few per cent: with selected inversion in float32, or
+    if the lowest eigenvalue is far above zero (with Dirichlet conditions) or above a potential's least value.
 
     Args:
         domain: a tensor field on a grid, a mesh of triangles or tetrahedra, or a pencil of either from `assemble`.
@@ -74,7 +74,7 @@ def hks_spectrum_free(
         TypeError: colouring on a mesh.
 
     Warns:
-        AccuracyWarning: rounding errors make concrete values NaN.
+        AccuracyWarning: concrete values are NaN, because errors may exceed a few per cent.
 
     Examples:
         >>> np.allclose(hj.hks_spectrum_free(field, [0.5]), hj.hks(pairs, [0.5]), atol=1e-4)
@@ -139,18 +139,21 @@ def _nan_if_lost(
     known, parts, times, scale = jax.lax.stop_gradient((values, pencil.parts, times, scale))
     if settings is None:
         eps, least = float(jnp.finfo(times.dtype).eps), jnp.stack([jnp.min(part.mass.diagonal()) for part in parts])
-        error = max(_ROUNDING, 10 * eps) / jnp.min(least)
+        error = max(_ROUNDING, eps) / jnp.min(least)
         late = eps * times * jnp.max(jnp.stack([largest(part) for part in parts])) > _LATE
     else:
         error = max(settings.error) / 50 * (4 * jnp.pi * times) ** (-len(settings.spacing) / 2)
         late = jnp.zeros(times.shape, bool)
     most = jnp.max(jnp.where(jnp.isnan(known), 0, jnp.abs(known)).reshape(times.size, -1), axis=1)
-    lost = late | (scale > 1) & ~(error * scale <= 0.01 * most)
+    # Constants, where they are functions of the space, keep the signature far above the error at any time.
+    decays = not any(part.n_null for part in parts)
+    lost = late | decays & ~(error * scale <= 0.01 * most)
     if not is_traced(lost) and lost.any():
         warn_of_accuracy(
             f"times: the signatures at {int(lost.sum())} of {times.size} times, the first {float(times[lost][0]):.4g}, "
-            f"are NaN, because rounding errors in {times.dtype} grow with t, in particular with a potential whose "
-            "least value is far below the lowest eigenvalue. Use eigenpairs or smaller times"
+            f"are NaN, because errors in {times.dtype} may exceed a few per cent. Relative errors grow with t, in "
+            "particular if the lowest eigenvalue is far above zero or above a potential's least value. Use eigenpairs "
+            "or smaller times"
         )
     return values * jnp.where(lost, jnp.nan, 1).astype(values.dtype).reshape(-1, *[1] * (values.ndim - 1))
 

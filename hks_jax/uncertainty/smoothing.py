@@ -33,7 +33,7 @@ def smooth_tensors(grid: Grid, tensors: Any, width: float) -> Float[Array, "*sha
         >>> np.allclose(np.linalg.det(smooth), 4.0, atol=1e-3)  # no volume is made
         True
     """
-    values = tensors_on(grid, "tensors", tensors)
+    values = spd.identity_outside(tensors_on(grid, "tensors", tensors), grid.inside)
     require_number("width", width, inclusive=True)
     if width == 0:
         return values
@@ -41,7 +41,7 @@ def smooth_tensors(grid: Grid, tensors: Any, width: float) -> Float[Array, "*sha
         weights = [jnp.asarray(each, values.dtype) for each in gaussians(grid, width)]
         inside = jnp.asarray(grid.inside, values.dtype)[..., None, None]
         total = jnp.where(inside > 0, along_axes(weights, inside), 1)
-    mean = along_axes(weights, spd.log(spd.identity_outside(values, grid.inside)) * inside) / total
+    mean = along_axes(weights, spd.log(values) * inside) / total
     return spd.exp(jnp.where(inside > 0, mean, 0))
 
 

@@ -144,6 +144,17 @@ def test_a_function_singular_outside_the_mask_spoils_no_gradient():
     assert jax.grad(volume)(1.0) == pytest.approx(float(volume(1.0)))
 
 
+@pytest.mark.parametrize("dtype", [np.float16, jnp.bfloat16])
+def test_half_precision_is_read_into_single_precision(dtype):
+    grid = hj.Grid.from_bounds(0, 1, (9, 9))
+    half = np.asarray(hj.examples.sphere_field(9).tensors).astype(dtype)
+    field = hj.TensorField(grid, half)
+    assert field.tensors.dtype == np.float32
+    np.testing.assert_array_equal(field.tensors, half.astype(np.float32))
+    single = hj.smooth_tensors(grid, half.astype(np.float32), 0.2)
+    np.testing.assert_array_equal(hj.smooth_tensors(grid, half, 0.2), single)
+
+
 def test_integer_tensors_become_floating(rng):
     assert hj.TensorField(hj.Grid((2, 2)), np.broadcast_to(np.eye(2, dtype=int), (2, 2, 2, 2))).tensors.dtype == float
 
