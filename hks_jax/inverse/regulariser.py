@@ -89,6 +89,13 @@ class TotalVariation(Regulariser):
         return gradient * jnp.sqrt(2 / (jnp.sqrt(square + self.epsilon**2) + self.epsilon))
 
 
+def _on(field: TensorField, prior: TensorField) -> Float[Array, "*shape d d"]:
+    """Return the tensors of a prior inside the mask of a fitted field, and the identity elsewhere."""
+    if prior.grid.shape != field.grid.shape or (field.grid.inside & ~prior.grid.inside).any():
+        raise ValueError(f"prior: got a field on {prior.grid}; expected tensors at all nodes inside {field.grid}")
+    return spd.identity_outside(prior.domain_tensors, field.grid.inside)
+
+
 class LogDeterminant(Regulariser):
     """The penalty ½ weight · mean (log |T| − log |T₀|)², where T₀ is `prior`; it preserves the volume element.
 
@@ -105,7 +112,7 @@ class LogDeterminant(Regulariser):
 
     def deviations(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, "..."]:
         """Return the differences of the logarithms of the determinants."""
-        return jnp.log(spd.determinant(field.domain_tensors) / spd.determinant(self.prior.domain_tensors))
+        return jnp.log(spd.determinant(field.domain_tensors) / spd.determinant(_on(field, self.prior)))
 
 
 class Prior(Regulariser):
@@ -124,4 +131,4 @@ class Prior(Regulariser):
 
     def deviations(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, "..."]:
         """Return log T − log T₀."""
-        return spd.log(field.domain_tensors) - spd.log(self.prior.domain_tensors)
+        return spd.log(field.domain_tensors) - spd.log(_on(field, self.prior))

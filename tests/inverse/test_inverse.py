@@ -360,6 +360,21 @@ def test_checkpoints_resume_where_a_fit_was_interrupted(tmp_path):
         hj.fit_metric(FLAT, target, TIMES, "conformal", k=K, checkpoint=tmp_path / "notes.txt")
 
 
+@pytest.mark.parametrize("penalty", [LogDeterminant, Prior])
+def test_only_nodes_inside_the_mask_count_in_a_penalty(penalty):
+    mask = np.ones((5, 5), bool)
+    mask[:2, :2] = False
+    whole = hj.TensorField(hj.Grid((5, 5)), np.tile(3 * np.eye(2), (5, 5, 1, 1)))
+    field = hj.TensorField(hj.Grid((5, 5), mask=mask), np.tile(np.eye(2), (5, 5, 1, 1)))
+    unknowns = Nodal(PARAMETRISATIONS["conformal"], field, mask)
+    residuals = penalty(2.0, whole).residuals(unknowns, unknowns.start(), field)
+    factor = 4 if penalty is LogDeterminant else 2
+    np.testing.assert_allclose(jnp.sum(residuals**2) / 2, factor * np.log(3) ** 2, rtol=1e-12)
+    unknowns = Nodal(PARAMETRISATIONS["conformal"], whole, np.ones((5, 5), bool))
+    with pytest.raises(ValueError, match=r"prior: got a field on Grid\(.*21 of 25 nodes\); expected tensors at all"):
+        penalty(2.0, field).residuals(unknowns, unknowns.start(), whole)
+
+
 def test_a_search_from_several_starts_keeps_its_best_fit_and_how_it_ended(tmp_path):
     grid = hj.Grid((5, 5), 0.25)
     flat = hj.TensorField(grid, np.tile(np.eye(2), (5, 5, 1, 1)))
