@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from hks_jax.arrays import StaticArray
-from hks_jax.checks import require_real
+from hks_jax.checks import real_array, require_real
 from hks_jax.domain import spd
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_field import TensorField
@@ -207,11 +207,14 @@ class Free(Unknowns):
 
     def start(self) -> Values:
         """Return the flattened initial parameters."""
-        return ravel_pytree(jax.tree.map(jnp.asarray, self.parameters))[0]
+        return self._ravelled()[0]
+
+    def _ravelled(self) -> tuple[Values, Callable[[Values], Any]]:
+        return ravel_pytree(jax.tree.map(lambda given: real_array("parameters", given), self.parameters))
 
     def field(self, values: Values) -> TensorField:
         """Return the field with given parameters."""
-        tensors = self.function(ravel_pytree(jax.tree.map(jnp.asarray, self.parameters))[1](values))
+        tensors = self.function(self._ravelled()[1](values))
         if isinstance(tensors, TensorField):
             return tensors
         assert self.init is not None

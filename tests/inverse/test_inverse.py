@@ -386,7 +386,7 @@ def test_a_search_from_several_starts_keeps_its_best_fit_and_how_it_ended(tmp_pa
 
     def fit(init=flat, **options):
         options = {"data": data, "search": search, "checkpoint": tmp_path / "fit.npz"} | options
-        return hj.fit_metric(init, target, None, Free(scaled, jnp.array(1.0)), **options)
+        return hj.fit_metric(init, target, None, Free(scaled, 1), **options)
 
     def interrupt(step):
         if step.start == 2 and step.step == 1:
