@@ -2,6 +2,7 @@
 
 import math
 import operator
+import os
 from contextlib import suppress
 from typing import Any
 
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hks_jax.arrays import jax_array
+from hks_jax.arrays import describe_array, jax_array
 from hks_jax.traced import is_traced
 
 
@@ -34,8 +35,11 @@ def require_number(
 
 
 def require_real(name: str, values: Any) -> None:
-    """Raise ValueError for complex numbers, masked values, and floating-point types that JAX does not support."""
+    """Raise ValueError for complex numbers, texts and other objects, masked values, and types JAX does not support."""
     leaves = jax.tree.leaves(values)
+    kinds = [getattr(getattr(leaf, "dtype", np.dtype(type(leaf))), "kind", None) for leaf in leaves]
+    if any(kind in tuple("OSUMm") and not callable(leaf) for kind, leaf in zip(kinds, leaves, strict=True)):
+        raise _no_numbers(name, values)
     if any(np.iscomplexobj(leaf) for leaf in leaves):
         raise ValueError(
             f"{name}: got complex numbers; expected real numbers. If imaginary parts are only rounding, pass .real"
@@ -51,8 +55,20 @@ def real_array(name: str, values: Any) -> Array:
     require_real(name, values)
     if isinstance(values, np.ndarray):
         values = values.astype(values.dtype.newbyteorder("="), copy=False)
-    array = jax_array(values)
+    try:
+        array = jax_array(values)
+    except (TypeError, ValueError, NotImplementedError) as error:
+        raise _no_numbers(name, values) from error
     return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(jnp.result_type(float))
+
+
+def _no_numbers(name: str, values: Any) -> ValueError:
+    remedy = next(
+        (f". Pass its .{part}" for part in ("tensors", "vertices", "todense()") if hasattr(values, part[:7])), ""
+    )
+    if isinstance(values, str | os.PathLike):
+        remedy = ". Read the file, and pass its array"
+    return ValueError(f"{name}: got {describe_array(values)[:200]}; expected an array of numbers{remedy}")
 
 
 def require_count(name: str, value: Any, least: int = 1) -> None:

@@ -18,7 +18,7 @@ from hks_jax.signatures.spectral_functions import (
     spectral_diagonal,
     spectral_squared_distances,
 )
-from hks_jax.signatures.times import dimension_of, positive_range, times_of, volume_of
+from hks_jax.signatures.times import dimension_of, positive_range, require_pairs, times_of, volume_of
 from hks_jax.signatures.truncation import resolved_times, truncation
 from hks_jax.traced import is_traced
 
@@ -58,6 +58,7 @@ def biharmonic_distance(pairs: Eigenpairs, sources: Any) -> Float[Array, "n_sour
         >>> print(d[0, 0, 0], jnp.isclose(d[0, 8, 8], d[1, 0, 0]))  # to itself; there and back
         0.0 True
     """
+    require_pairs(pairs)
     known = pairs.null_space_known or not is_traced(jax.lax.stop_gradient(pairs.eigenvalues))
     if known and pairs.n_null > 1:
         raise ValueError(
@@ -83,7 +84,7 @@ def shape_dna(pairs: Eigenpairs, normalise: bool = True) -> Float[Array, " k"]:
         >>> np.allclose(hj.shape_dna(nine), hj.shape_dna(pairs), atol=1e-2)
         True
     """
-    values = pairs.eigenvalues
+    values = require_pairs(pairs).eigenvalues
     if normalise:
         dimension = dimension_of(pairs, "normalised ShapeDNA")
         values = values * volume_of(pairs, "normalised ShapeDNA") ** (2 / dimension)

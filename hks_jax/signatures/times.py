@@ -112,9 +112,8 @@ def default_energies(pairs: Eigenpairs, n: int = 100) -> tuple[Float[Array, " n"
         >>> print(jnp.isclose(energies[0], jnp.log(pairs.eigenvalues[1]) + 2 * sigma))
         True
     """
-    if n < 29:
-        raise ValueError(f"n: got {n}; expected at least 29, so that the range of energies exceeds 4σ")
-    if _n_positive(pairs) < 2:
+    require_count("n", n, 29)  # fewer energies would not exceed the range 4σ
+    if _n_positive(require_pairs(pairs)) < 2:
         raise ValueError(
             f"pairs: got {_n_positive(pairs)} positive eigenvalue(s); expected at least two. Compute more eigenpairs"
         )
