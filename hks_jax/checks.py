@@ -59,6 +59,8 @@ def real_array(name: str, values: Any) -> Array:
         array = jax_array(values)
     except (TypeError, ValueError, NotImplementedError) as error:
         raise _no_numbers(name, values) from error
+    if jnp.issubdtype(array.dtype, jnp.floating) and array.dtype.itemsize < 4:
+        raise ValueError(f"{name}: got dtype {array.dtype}; expected float32 or float64. Use .astype(np.float32)")
     return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(jnp.result_type(float))
 
 

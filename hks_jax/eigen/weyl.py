@@ -11,7 +11,7 @@ from hks_jax.domain.components import wrap_nodes
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.domain.triangulation import FACETS
-from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.eigenpairs import Eigenpairs, require_pairs
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
 from hks_jax.fem.space import FunctionSpace, GridSpace, MeshSpace
 
@@ -54,7 +54,7 @@ def weyl_count(
         >>> print(hj.weyl_count(pairs, [20 * np.pi]).round(1))  # area · λ/4π
         [10.]
     """
-    pencil = problem.pencil if isinstance(problem, Eigenpairs) else problem
+    pencil = require_pairs(problem).pencil if isinstance(problem, Eigenpairs) else problem
     if not isinstance(pencil, Pencil | MirrorPencil):
         raise TypeError(f"problem: got {type(problem).__name__}; expected the result of `eigenpairs` or `assemble`")
     d = pencil.space.dimension

@@ -200,8 +200,6 @@ def _symmetric(name: str, matrix: Any) -> Matrix:
     array = real_array(name, matrix)
     if array.ndim != 2 or array.shape[0] != array.shape[1] or array.size == 0:
         raise ValueError(f"{name}: got shape {array.shape}; expected (n, n). Use jax.vmap for several matrices")
-    if array.dtype not in (jnp.float32, jnp.float64):
-        raise ValueError(f"{name}: got dtype {array.dtype}; expected float32 or float64")
     if not is_traced(array):
         known, limit = np.asarray(array), float(jnp.finfo(array.dtype).eps) ** 0.5
         with np.errstate(invalid="ignore"):

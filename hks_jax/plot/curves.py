@@ -17,11 +17,10 @@ from hks_jax.domain.grid import Grid
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_checks import require_grid
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.eigenpairs import Eigenpairs, require_pairs
 from hks_jax.eigen.weyl import weyl_count
 from hks_jax.plot.figure import SMALL, number_text
 from hks_jax.plot.panels import checked_times
-from hks_jax.signatures.times import require_pairs
 
 
 def hks_curves(

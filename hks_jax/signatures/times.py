@@ -12,21 +12,10 @@ from jaxtyping import Array, Bool, Float
 from hks_jax.checks import checked_times, require_count, require_number
 from hks_jax.compilation import numpy_where_known
 from hks_jax.domain.components import label_nodes
-from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.eigenpairs import Eigenpairs, require_pairs
 from hks_jax.eigen.weyl import weyl, weyl_number
 from hks_jax.fem.boundary import BoundarySpec, doubled_problems, normalise_boundary
 from hks_jax.traced import is_traced
-
-
-def require_pairs(pairs: Eigenpairs) -> Eigenpairs:
-    """Return the pairs; raise TypeError or ValueError unless they are eigenpairs of one domain."""
-    if not isinstance(pairs, Eigenpairs):
-        raise TypeError(f"pairs: got {type(pairs).__name__}; expected the result of `eigenpairs`")
-    if pairs.eigenvalues.ndim != 1:
-        raise ValueError(
-            f"pairs: got a batch with eigenvalues of shape {pairs.eigenvalues.shape}; expected (k,). Use jax.vmap"
-        )
-    return pairs
 
 
 def times_of(pairs: Eigenpairs, times: Any) -> Float[Array, " n"]:

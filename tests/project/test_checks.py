@@ -163,6 +163,10 @@ def test_other_objects_than_arrays_fields_and_eigenpairs_are_named_with_a_remedy
         (lambda: hj.TensorField(GRID, None), "tensors: got None; expected an array of numbers"),
         (lambda: hj.TensorField.from_function(GRID, np.eye), "grid: got function; expected hks_jax.Grid"),
         (lambda: hj.TensorField.from_function(GRID, GRID), "fn: got Grid; expected a function from coordinates"),
+        (
+            lambda: hj.TensorField(GRID, np.ones((4, 5, 2, 2), np.float16)),
+            "tensors: got dtype float16; expected float32",
+        ),
         (lambda: hj.Grid((4, 5), mask=np.ma.array(np.ones((4, 5)), mask=np.eye(4, 5))), "mask: got a masked array"),
         (lambda: hj.eigh(matrix), r"A: got .*; expected an array of numbers. Pass its .todense\(\)"),
         (lambda: hj.eigenpairs(FIELD.tensors), r"K: got shape .* For tensors, pass TensorField\(grid, tensors\)"),
@@ -195,7 +199,10 @@ def test_other_objects_than_arrays_fields_and_eigenpairs_are_named_with_a_remedy
 
 def test_settings_without_meaning_are_refused():
     known = pairs()
+    batch = jax.tree.map(lambda x: jnp.stack([x, x]), known)
     calls = [
+        (batch.summary, r"pairs: got a batch with eigenvalues of shape \(2, 5\)"),
+        (lambda: hj.weyl_count(batch, [1.0]), r"pairs: got a batch with eigenvalues of shape \(2, 5\)"),
         (lambda: hj.heat_coefficients(known, 1, condition="Neumann"), "condition: got 'Neumann'; expected \"neumann\""),
         (lambda: hj.heat_coefficients(known, NAN), "euler_characteristic: got nan"),
         (lambda: hj.heat_coefficients(known, 1, -1.0), "boundary_length: got -1.0"),
