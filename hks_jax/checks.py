@@ -65,9 +65,8 @@ def real_array(name: str, values: Any) -> Array:
 
 
 def _no_numbers(name: str, values: Any) -> ValueError:
-    remedy = next(
-        (f". Pass its .{part}" for part in ("tensors", "vertices", "todense()") if hasattr(values, part[:7])), ""
-    )
+    parts = [part for part in ("tensors", "vertices", "todense()") if hasattr(values, part.rstrip("()"))]
+    remedy = f". Pass its .{parts[0]}" if parts else ""
     if isinstance(values, str | os.PathLike):
         remedy = ". Read the file, and pass its array"
     return ValueError(f"{name}: got {describe_array(values)[:200]}; expected an array of numbers{remedy}")

@@ -168,6 +168,10 @@ def test_other_objects_than_arrays_fields_and_eigenpairs_are_named_with_a_remedy
             "tensors: got dtype float16; expected float32",
         ),
         (lambda: hj.Grid((4, 5), mask=np.ma.array(np.ones((4, 5)), mask=np.eye(4, 5))), "mask: got a masked array"),
+        (
+            lambda: hj.SurfaceMesh(mesh, mesh.faces),
+            "vertices: got .*; expected .*. Pass its .vertices",
+        ),
         (lambda: hj.eigh(matrix), r"A: got .*; expected an array of numbers. Pass its .todense\(\)"),
         (lambda: hj.eigenpairs(FIELD.tensors), r"K: got shape .* For tensors, pass TensorField\(grid, tensors\)"),
         (lambda: hj.eigenpairs(FIELD, interval=3.0), r"interval: got shape \(\); expected the ends \(a, b\)"),
