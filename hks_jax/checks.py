@@ -2,6 +2,7 @@
 
 import math
 import operator
+import os
 from contextlib import suppress
 from typing import Any
 
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hks_jax.arrays import jax_array
+from hks_jax.arrays import describe_array, jax_array
 from hks_jax.traced import is_traced
 
 
@@ -34,8 +35,12 @@ def require_number(
 
 
 def require_real(name: str, values: Any) -> None:
-    """Raise ValueError for complex numbers, masked values, and floating-point types that JAX does not support."""
+    """Raise ValueError for complex numbers, texts and other objects, masked values, and types JAX does not support."""
     leaves = jax.tree.leaves(values)
+    dtypes = [leaf.dtype if hasattr(leaf, "dtype") else np.dtype(type(leaf)) for leaf in leaves]
+    kinds = [getattr(dtype, "kind", None) for dtype in dtypes]
+    if any(kind in tuple("OSUMm") and not callable(leaf) for kind, leaf in zip(kinds, leaves, strict=True)):
+        raise _no_numbers(name, values)
     if any(np.iscomplexobj(leaf) for leaf in leaves):
         raise ValueError(
             f"{name}: got complex numbers; expected real numbers. If imaginary parts are only rounding, pass .real"
@@ -51,10 +56,21 @@ def real_array(name: str, values: Any) -> Array:
     require_real(name, values)
     if isinstance(values, np.ndarray):
         values = values.astype(values.dtype.newbyteorder("="), copy=False)
-    array = jax_array(values)
+    try:
+        array = jax_array(values)
+    except (TypeError, ValueError, NotImplementedError) as error:
+        raise _no_numbers(name, values) from error
     if not jnp.issubdtype(array.dtype, jnp.floating):
         return array.astype(jnp.result_type(float))
     return array.astype(jnp.float32) if array.dtype.itemsize < 4 else array
+
+
+def _no_numbers(name: str, values: Any) -> ValueError:
+    parts = [part for part in ("tensors", "vertices", "todense()") if hasattr(values, part.rstrip("()"))]
+    remedy = f". Pass its .{parts[0]}" if parts else ""
+    if isinstance(values, str | os.PathLike):
+        remedy = ". Read the file, and pass its array"
+    return ValueError(f"{name}: got {describe_array(values)[:200]}; expected an array of numbers{remedy}")
 
 
 def require_count(name: str, value: Any, least: int = 1) -> None:

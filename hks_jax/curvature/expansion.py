@@ -25,7 +25,7 @@ from hks_jax.curvature.jet import (
     wraps_per_axis,
 )
 from hks_jax.domain import spd
-from hks_jax.domain.tensor_field import TensorField
+from hks_jax.domain.tensor_field import TensorField, require_field
 
 Coefficients: TypeAlias = list[Array]
 Pair: TypeAlias = tuple[taylor.Series, taylor.Series]
@@ -75,6 +75,7 @@ def hks_expansion(
         >>> print((4 * jnp.pi * 0.1 * expansion).round(3))  # 1 + t/3
         1.033
     """
+    require_field(field)
     dimension = field.grid.dimension
     highest = HIGHEST_ORDER[dimension]
     order = highest if order is None else order

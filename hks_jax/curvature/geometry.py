@@ -22,7 +22,7 @@ from hks_jax.curvature.jet import (
     wraps_per_axis,
 )
 from hks_jax.domain import spd
-from hks_jax.domain.tensor_field import TensorField
+from hks_jax.domain.tensor_field import TensorField, require_field
 
 
 @nan_is_meant
@@ -43,6 +43,7 @@ def scalar_curvature(field: TensorField, periodic: bool | Sequence[bool] = False
         >>> print(hj.scalar_curvature(hj.examples.hyperbolic_field(9))[4, 4].round(3))  # 2K
         -2.0
     """
+    require_field(field)
     return _at_nodes(scalar, field, wraps_per_axis(periodic, field.grid.dimension))
 
 
@@ -65,6 +66,7 @@ def gaussian_curvature(field: TensorField, periodic: bool | Sequence[bool] = Fal
         >>> print(K.min().round(3), K.max().round(3))
         1.0 1.0
     """
+    require_field(field)
     if field.grid.dimension != 2:
         raise ValueError(
             f"field: got a grid of shape {field.grid.shape}; expected a metric in two dimensions. Take a "
@@ -165,6 +167,7 @@ def laplace_beltrami(
         >>> print(hj.laplace_beltrami(field, lambda x: (x + 0.3) @ (x + 0.3))[4, 4].round(3))  # of r²
         4.0
     """
+    require_field(field)
     if callable(f):
         f = f if isinstance(f, jtu.Partial) else jtu.Partial(f)
     else:

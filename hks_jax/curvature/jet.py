@@ -191,7 +191,7 @@ def at_nodes(fn: Callable[[Array], Any], grid: Grid, inside: Bool[np.ndarray, "*
 
 def wraps_per_axis(periodic: bool | Sequence[bool], dimension: int) -> tuple[bool, ...]:
     """Return which axes are periodic; raise ValueError unless the argument is a bool or one bool per axis."""
-    wraps = (periodic,) * dimension if isinstance(periodic, bool | np.bool_) else tuple(periodic)
+    wraps = (periodic,) * dimension if isinstance(periodic, bool | np.bool_) else tuple(np.atleast_1d(periodic))
     if len(wraps) != dimension or not all(isinstance(wrap, bool | np.bool_) for wrap in wraps):
         raise ValueError(f"periodic: got {periodic!r}; expected True, False, or a tuple of {dimension}, one per axis")
     return tuple(bool(wrap) for wrap in wraps)

@@ -14,8 +14,8 @@ from hks_jax.checks import require_real
 
 def as_mask(name: str, values: Any) -> Bool[np.ndarray, "*shape"]:
     """Return a mask of zeros and ones as booleans; raise ValueError for other values."""
+    require_real(name, values)
     array = np.asarray(values)
-    require_real(name, array)
     if array.dtype != bool and not np.isin(array, (0, 1)).all():
         raise ValueError(
             f"{name}: got dtype {array.dtype} with values other than 0 and 1; expected booleans. Threshold them, for "

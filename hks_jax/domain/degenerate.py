@@ -8,8 +8,9 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from hks_jax.checks import require_count
 from hks_jax.domain.components import active_elements
-from hks_jax.domain.tensor_field import TensorField
+from hks_jax.domain.tensor_field import TensorField, require_field
 
 
 class DegeneratePoints(NamedTuple):
@@ -52,14 +53,14 @@ def degenerate_points(field: TensorField, merge: int = 2) -> DegeneratePoints:
         >>> hj.degenerate_points(hj.examples.degenerate_point_field(0.5, 9))
         DegeneratePoints(positions=array([[0., 0.]]), indices=array([0.5]))
     """
+    require_field(field)
     grid = field.grid
     if grid.dimension != 2:
         raise ValueError(
             f"field: got a grid of shape {grid.shape}; expected 2 dimensions. In 3D equal eigenvalues form curves; "
             "take a slice"
         )
-    if merge < 1:
-        raise ValueError(f"merge: got {merge}; expected at least 1 cell")
+    require_count("merge", merge)
     nodal = np.asarray(field.domain_tensors)
     tensors = nodal.astype(np.float64)
     v = np.stack([tensors[..., 0, 0] - tensors[..., 1, 1], 2 * tensors[..., 0, 1]], axis=-1)

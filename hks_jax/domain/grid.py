@@ -62,6 +62,11 @@ class Grid(ByKey):
             raise ValueError(f'components: got {components!r}; expected "raise", "largest" or "all"')
         self._mask = None if mask is None else StaticArray(_checked_mask(mask, self.shape, components))
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        if "_mask" in vars(self):  # the last attribute that __init__ sets
+            raise AttributeError(f"{name}: a grid cannot be changed, because JAX caches programs by it; make another")
+        super().__setattr__(name, value)
+
     @classmethod
     def from_bounds(
         cls,
@@ -122,7 +127,7 @@ class Grid(ByKey):
     def unit(self) -> "Grid":
         """The grid with the same shape and mask, but with spacing 1 and origin 0."""
         unit = Grid(self.shape)
-        unit._mask = self._mask
+        vars(unit)["_mask"] = self._mask
         return unit
 
     @cached_property

@@ -21,6 +21,7 @@ from hks_jax.domain.tensor_checks import (
     check_metric_choice,
     checked_interpolation,
     positive_map,
+    require_grid,
     require_spd,
     right_cauchy_green,
     tensors_on,
@@ -79,6 +80,11 @@ class TensorField(eqx.Module):
             >>> print(hj.gaussian_curvature(half_plane)[4, 4].round(3))
             -1.0
         """
+        require_grid(grid)
+        if not callable(fn):
+            raise TypeError(
+                f"fn: got {type(fn).__name__}; expected a function from coordinates (d,) to a tensor (d, d)"
+            )
         function: Any = fn if isinstance(fn, jtu.Partial | eqx.Module) else jtu.Partial(fn)
         _checked_tensors("fn", grid, _evaluate(function, grid))
         return cls._checked(grid, interpolation, function=function)
@@ -223,6 +229,15 @@ class TensorField(eqx.Module):
 def _metric_of_diffusion(xp: Any, D: Any, metric: MetricChoice) -> Any:
     # In three dimensions −D and D have the same adjugate, so D is set to NaN where it is not positive definite.
     return spd.metric_of_diffusion(spd.nan_unless_positive(xp, D), metric)
+
+
+def require_field(field: Any) -> None:
+    """Raise TypeError for anything that is not a tensor field."""
+    if not isinstance(field, TensorField):
+        raise TypeError(
+            f"field: got {type(field).__name__}; expected hks_jax.TensorField. For an array T (*shape, d, d), pass "
+            "TensorField(Grid(shape), T)"
+        )
 
 
 def _evaluate(function: jtu.Partial, grid: Grid) -> Float[Array, "*shape_and_components"]:

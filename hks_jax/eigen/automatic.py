@@ -44,7 +44,7 @@ def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensol
         return solver
     if solver == "auto":
         return _automatic(pencil, k)
-    if solver not in SOLVERS:
+    if not isinstance(solver, str) or solver not in SOLVERS:
         raise ValueError(
             f'solver: got {solver!r}; expected "auto", {", ".join(f"{name!r}" for name in SOLVERS)} or a solver object'
         )

@@ -216,7 +216,7 @@ class Eigenpairs(eqx.Module):
 
     def summary(self) -> str:
         """Describe size, method, range and quality in a few lines. Values must be concrete."""
-        if not self.k:
+        if not require_pairs(self).k:
             return "no eigenpairs: the interval contains no eigenvalue"
         values, residuals = np.asarray(self.eigenvalues), np.asarray(self.residuals)
         kept, following = int(np.asarray(self.kept).sum()), float(self.next_eigenvalue)
@@ -232,6 +232,18 @@ class Eigenpairs(eqx.Module):
         if kept < self.k:
             lines.append(f"{kept} of them kept, so that no multiple eigenvalue is cut")
         return "\n".join(lines + self.messages())
+
+
+def require_pairs(pairs: Eigenpairs) -> Eigenpairs:
+    """Return the pairs; raise TypeError or ValueError unless they are eigenpairs of one domain."""
+    if not isinstance(pairs, Eigenpairs):
+        raise TypeError(f"pairs: got {type(pairs).__name__}; expected the result of `eigenpairs`")
+    if pairs.eigenvalues.ndim != 1:
+        raise ValueError(
+            f"pairs: got a batch with eigenvalues of shape {pairs.eigenvalues.shape}; expected (k,). Use jax.vmap, or "
+            "jax.tree.map(lambda x: x[i], pairs) for one of them"
+        )
+    return pairs
 
 
 def _anisotropy(pencil: AnyPencil | None) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from hks_jax.arrays import jax_array
-from hks_jax.checks import require_count
+from hks_jax.checks import real_array, require_count
 from hks_jax.compilation import is_concrete_on_cpu, jit_quickly, numpy_where_known
 from hks_jax.eigen.adjoints.adjoint import Scalar
 from hks_jax.eigen.derivative import frame_of_chosen, solved
@@ -121,7 +121,10 @@ def solve_interval(
 
 def checked_interval(pencil: Pencil, interval: tuple[float, float], k: int | None) -> Interval:
     """Check a user's interval, as `eigenpairs` documents, and count its eigenvalues; also under `jit`."""
-    low, high = (jnp.asarray(end, pencil.stiffness.dtype) for end in interval)
+    ends = real_array("interval", interval).astype(pencil.stiffness.dtype)
+    if ends.shape != (2,):
+        raise ValueError(f"interval: got shape {ends.shape}; expected the ends (a, b)")
+    low, high = ends
     if is_traced((pencil, low, high)):
         if k is None:
             raise ValueError(

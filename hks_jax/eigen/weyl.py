@@ -11,8 +11,8 @@ from hks_jax.domain.components import wrap_nodes
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.domain.triangulation import FACETS
-from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.fem.pencil import AnyPencil
+from hks_jax.eigen.eigenpairs import Eigenpairs, require_pairs
+from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
 from hks_jax.fem.space import FunctionSpace, GridSpace, MeshSpace
 
 
@@ -54,7 +54,9 @@ def weyl_count(
         >>> print(hj.weyl_count(pairs, [20 * np.pi]).round(1))  # area · λ/4π
         [10.]
     """
-    pencil = problem.pencil if isinstance(problem, Eigenpairs) else problem
+    pencil = require_pairs(problem).pencil if isinstance(problem, Eigenpairs) else problem
+    if not isinstance(pencil, Pencil | MirrorPencil):
+        raise TypeError(f"problem: got {type(problem).__name__}; expected the result of `eigenpairs` or `assemble`")
     d = pencil.space.dimension
     volume = pencil.volume if pencil.measured else None
     if volume is None:
@@ -65,6 +67,8 @@ def weyl_count(
     numbers = np.asarray(values, np.float64)
     if not (np.isfinite(numbers) & (numbers >= 0)).all():
         raise ValueError(f"values: got {numbers.min()}; expected finite, nonnegative numbers")
+    if not isinstance(domain, TensorField | SimplicialMesh | None):
+        raise TypeError(f"domain: got {type(domain).__name__}; expected a TensorField or a mesh")
     if domain is None:
         return weyl_number(numbers, float(volume), d)
     shape = domain.grid.shape if isinstance(domain, TensorField) else (len(domain.vertices),)

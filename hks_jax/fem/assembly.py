@@ -7,6 +7,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from hks_jax.accuracy import warn_of_accuracy
+from hks_jax.arrays import describe_array
 from hks_jax.checks import require_count
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
@@ -177,6 +178,8 @@ def _checked_operator(
         if is_traced([cell.cell_contents for cell in getattr(form, "__closure__", None) or ()]):
             raise ValueError(f"{name}: the form closes over traced arrays or numbers; pass all of them as fields={{…}}")
     require_count("components", components)
+    if not isinstance(fields, Mapping | None):
+        raise ValueError(f"fields: got {describe_array(fields)}; expected a dictionary {{name: array}}")
     own, given = stiffness is not None or callable(mass), dict(fields or {})
     named = {name: value for name, value in (("potential", potential), ("density", density)) if value is not None}
     if own and named:

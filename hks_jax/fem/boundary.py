@@ -8,9 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hks_jax.domain.components import active_elements, element_nodes, rim_nodes
+from hks_jax.checks import require_count
+from hks_jax.domain.components import active_elements, as_mask, element_nodes, rim_nodes
 from hks_jax.domain.grid import Grid
-from hks_jax.domain.tensor_field import TensorField
+from hks_jax.domain.tensor_checks import require_grid
+from hks_jax.domain.tensor_field import TensorField, require_field
 
 Sides: TypeAlias = tuple[str, str]
 """The conditions at the low and the high side of one axis."""
@@ -79,6 +81,7 @@ def default_boundary(inside: Bool[np.ndarray, "*shape"]) -> tuple[str, str]:
         >>> hj.default_boundary(field.grid.inside)
         ('neumann', 'the domain has no mask')
     """
+    inside = as_mask("inside", inside)
     if inside.all():
         return "neumann", "the domain has no mask"
     every_axis = (False,) * inside.ndim
@@ -137,6 +140,8 @@ def reflect(field: TensorField, width: int) -> TensorField:
         >>> np.allclose(wide.tensors[1, 6], field.tensors[1, 4] * jnp.array([[1.0, -1.0], [-1.0, 1.0]]))
         True
     """
+    require_field(field)
+    require_count("width", width)
     grid, d = field.grid, field.grid.dimension
     if not 1 <= width <= min(grid.shape) - 1:
         raise ValueError(f"width: got {width}; expected 1 … {min(grid.shape) - 1} nodes for shape {grid.shape}")
@@ -161,7 +166,10 @@ def crop(
         >>> np.allclose(hj.crop(wide.tensors[..., 0, 1], field.grid), field.tensors[..., 0, 1])
         True
     """
-    d = grid.dimension
+    require_grid(grid)
+    values, d = values if hasattr(values, "shape") else np.asarray(values), grid.dimension
+    if values.ndim < d:
+        raise ValueError(f"values: got shape {values.shape}; expected at least {d} axes")
     excess = [big - n for big, n in zip(np.shape(values)[-d:], grid.shape, strict=True)]
     if min(excess) < 0 or any(e % 2 for e in excess):
         raise ValueError(

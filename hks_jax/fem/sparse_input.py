@@ -259,7 +259,8 @@ def _diagonal(M: Any, n: int, dtype: np.dtype) -> Array | None:
 
 def _check_square(name: str, shape: tuple[int, ...]) -> None:
     if len(shape) != 2 or shape[0] != shape[1] or shape[0] == 0:
-        raise ValueError(f"{name}: got shape {tuple(shape)}; expected a square matrix (n, n)")
+        remedy = ". For tensors, pass TensorField(grid, tensors)" * (len(shape) > 2)
+        raise ValueError(f"{name}: got shape {tuple(shape)}; expected a square matrix (n, n){remedy}")
 
 
 @partial(jax.jit, static_argnums=3)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -22,11 +23,17 @@ from hks_jax.inverse.unknowns import named
 
 Loss = Callable[[Array, Array], Array]
 
-LOSSES: dict[str, Loss] = {
-    "log": lambda predicted, target: jnp.log(predicted) - jnp.log(target),
-    "relative": lambda predicted, target: predicted / target - 1,
-    "absolute": lambda predicted, target: predicted - target,
-}
+
+# A lambda here would prevent the pickling of fits.
+def _log_ratio(predicted: Array, target: Array) -> Array:
+    return jnp.log(predicted) - jnp.log(target)
+
+
+def _relative(predicted: Array, target: Array) -> Array:
+    return predicted / target - 1
+
+
+LOSSES: dict[str, Loss] = {"log": _log_ratio, "relative": _relative, "absolute": operator.sub}
 
 
 @dataclasses.dataclass(frozen=True)

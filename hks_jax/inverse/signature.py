@@ -1,6 +1,7 @@
 """The signatures that a fit can match: their values and the number of eigenpairs they need."""
 
 import math
+import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -83,10 +84,14 @@ def wave_kernel(sigma: float | Float[Array, ""]) -> Signature:
     return Signature(wks, "e", at_nodes=True, sigma=jnp.asarray(sigma))
 
 
+def _tail(pairs: Eigenpairs, times: Any) -> Array:
+    return truncation(pairs, times).tail
+
+
 SIGNATURES = {
     "hks": Signature(hks, "t", at_nodes=True, left_out=truncation_map),
-    "heat-trace": Signature(heat_trace, "t", left_out=lambda pairs, times: truncation(pairs, times).tail),
-    "eigenvalues": Signature(lambda pairs: pairs.eigenvalues, lowest=True),
+    "heat-trace": Signature(heat_trace, "t", left_out=_tail),
+    "eigenvalues": Signature(operator.attrgetter("eigenvalues"), lowest=True),
 }
 
 

@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -110,17 +111,17 @@ def _rotation(vector: Float[Array, "n 3"]) -> Tensors:
     return jnp.eye(3, dtype=vector.dtype) + sinc[:, None, None] * cross + versine[:, None, None] * square_of_cross
 
 
-def _zeros(count: Callable[[int], int]) -> Callable[[Tensors], Parameters]:
-    return lambda base: jnp.zeros((len(base), count(base.shape[-1])), base.dtype)
+def _zeros(counts: tuple[int, int], base: Tensors) -> Parameters:
+    return jnp.zeros((len(base), counts[base.shape[-1] - 2]), base.dtype)
 
 
 PARAMETRISATIONS = {
     # The initial tensor is T₀ = V diag(λᵢ) Vᵀ, with eigenvectors in V and eigenvalues λᵢ.
     "log-euclidean": Parametrisation(_logarithm, _exponential),  # T = exp S for a symmetric matrix S
     "cholesky": Parametrisation(_cholesky, _from_cholesky),  # T = LLᵀ for a lower triangular matrix L
-    "conformal": Parametrisation(_zeros(lambda d: 1), _scaled, smooth=False),  # T = e^u T₀ for a number u
-    "eigenvalues": Parametrisation(_zeros(lambda d: d), _stretched),  # T = V diag(e^uᵢ λᵢ) Vᵀ for numbers uᵢ
-    "rotation": Parametrisation(_zeros(lambda d: 1 if d == 2 else 3), _turned),  # T = R T₀ Rᵀ for a rotation R
+    "conformal": Parametrisation(partial(_zeros, (1, 1)), _scaled, smooth=False),  # T = e^u T₀ for a number u
+    "eigenvalues": Parametrisation(partial(_zeros, (2, 3)), _stretched),  # T = V diag(e^uᵢ λᵢ) Vᵀ for numbers uᵢ
+    "rotation": Parametrisation(partial(_zeros, (1, 3)), _turned),  # T = R T₀ Rᵀ for a rotation R
 }
 
 

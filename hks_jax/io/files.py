@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from hks_jax.checks import require_number
+from hks_jax.checks import require_number, require_real
 from hks_jax.domain.simplices import WORDS
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.io import mesh, nifti
@@ -22,6 +22,8 @@ from hks_jax.io.units import Unit, in_mm2_per_s
 from hks_jax.io.volume import TensorVolume, describe, digest
 from hks_jax.io.vtk_image import by_time
 from hks_jax.storage import write_npz
+
+_PLACE = ("spacing", "origin", "mask", "affine", "slice_axis", "length_unit", "unit", "vertices", "faces", "cells")
 
 
 def read_tensors(
@@ -154,6 +156,11 @@ def save(
         >>> np.array_equal(np.load(path)["hks"], hj.hks(pairs, [0.5]))
         True
     """
+    if not isinstance(volume, TensorVolume | SimplicialMesh):
+        raise TypeError(f"volume: got {type(volume).__name__}; expected a TensorVolume or a mesh")
+    require_real("values", values)
+    if name in (*_PLACE, *(extra or ())):
+        raise ValueError(f"name: got {name!r}, which is the name of another array in the file; choose another name")
     file, array = Path(path), np.asarray(values)
     if array.dtype not in (np.float32, np.float64) and not file.name.lower().endswith(".npz"):
         array = array.astype(np.uint8 if array.dtype == bool else np.float64)
@@ -201,6 +208,8 @@ def save_tensors(
         >>> np.array_equal(hj.io.read_tensors(path).tensors, volume.tensors)
         True
     """
+    if not isinstance(volume, TensorVolume):
+        raise TypeError(f"volume: got {type(volume).__name__}; expected a TensorVolume")
     file = Path(path)
     write = format_of(file, WRITTEN).write_tensors
     assert write is not None

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Integer
 from scipy import ndimage
 
+from hks_jax.checks import require_count
 from hks_jax.domain.components import as_mask
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.io.formats import IMAGES, format_of
@@ -44,7 +45,7 @@ def mask_on(
     shape: tuple[int, ...], affine: np.ndarray | None, mask: str | os.PathLike[str] | np.ndarray
 ) -> Bool[np.ndarray, "*shape"]:
     """Return the mask in a file or an array; raise ValueError unless the mask has the shape of the image."""
-    inside = as_mask("mask", mask) if isinstance(mask, np.ndarray) else read_mask(mask, affine)
+    inside = read_mask(mask, affine) if isinstance(mask, str | os.PathLike) else as_mask("mask", mask)
     if inside.shape != shape:
         raise ValueError(f"mask: got shape {inside.shape}; expected the shape of the image, {shape}")
     return inside
@@ -63,13 +64,12 @@ def erode(mask: Bool[np.ndarray, "*shape"], iterations: int = 1) -> Bool[np.ndar
         >>> print(hj.io.erode(np.pad(np.ones((3, 3), bool), 1)).sum())
         1
     """
-    if iterations < 0:
-        raise ValueError(f"iterations: got {iterations}; expected 0 or more")
+    require_count("iterations", iterations, 0)
     if iterations == 0:
         return mask
-    eroded = ndimage.binary_erosion(mask, iterations=iterations, border_value=1)
+    eroded = ndimage.binary_erosion(as_mask("mask", mask), iterations=iterations, border_value=1)
     if not eroded.any():
-        raise ValueError(f"iterations: got {iterations}, which removes all {int(mask.sum())} voxels. Choose fewer")
+        raise ValueError(f"iterations: got {iterations}, which removes all {int(np.sum(mask))} voxels. Choose fewer")
     return eroded
 
 

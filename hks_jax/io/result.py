@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from hks_jax import Grid, SurfaceMesh, TetMesh
 from hks_jax.arrays import describe_array
+from hks_jax.checks import require_real
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.io.arrays import volume_of
 from hks_jax.io.files import save
@@ -54,6 +55,19 @@ class Result:
     arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
     name: str = "hks"
     source: str = ""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.place, TensorVolume | SimplicialMesh):
+            raise TypeError(f"place: got {type(self.place).__name__}; expected a TensorVolume or a mesh")
+        for name in ("values", "times", "eigenvalues"):
+            require_real(name, getattr(self, name))
+            object.__setattr__(self, name, np.asarray(getattr(self, name)))
+        shape = self.place.shape if isinstance(self.place, TensorVolume) else (len(self.place.vertices),)
+        if self.values.shape[1:] != shape or self.times.shape not in ((0,), self.values.shape[:1]):
+            raise ValueError(
+                f"values: got shape {self.values.shape} and times of shape {self.times.shape}; expected "
+                f"{('n_times', *shape)} and (n_times,), or one field and no times"
+            )
 
     def __repr__(self) -> str:
         """Return a summary in one line, without the arrays."""
@@ -110,7 +124,9 @@ class Result:
             # Only a mesh with a mask may have vertices that belong to no cell, which are outside the domain.
             place = kind(arrays["vertices"], cells, mask=np.ones(cells.shape[:1], bool))
         eigenvalues, report = arrays.get("eigenvalues", np.zeros(0)), {"settings": record.get("settings") or {}}
-        more = {n: a for n, a in arrays.items() if n in ("deviation", "noise_maps", "scaled_times", "input_tensors")}
+        more = {
+            n: a for n, a in arrays.items() if n in ("deviation", "bias", "noise_maps", "scaled_times", "input_tensors")
+        }
         return cls(place, values, times, eigenvalues, report, more, name, str(path))
 
     def save(self, stem: Path, image: str, origin: Mapping[str, Any] | None = None) -> None:

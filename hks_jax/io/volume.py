@@ -95,15 +95,18 @@ class TensorVolume:
 
     def __post_init__(self) -> None:
         where = f"{self.source}: " if self.source else ""
-        tensors, mask, covariance = self.tensors, self.mask, self.covariance
-        require_real(f"{where}tensors", tensors)
-        shape, d = tensors.shape[:-2], tensors.shape[-1]
+        for name in ("tensors", "affine", "covariance", "modes"):
+            if (value := getattr(self, name)) is not None or name == "tensors":
+                require_real(f"{where}{name}", value)
+                object.__setattr__(self, name, np.asarray(value))
+        tensors, mask = self.tensors, self.mask
+        shape, d = tensors.shape[:-2], tensors.ndim - 2
         if tensors.ndim not in (4, 5) or tensors.shape[-2:] != (len(shape),) * 2:
             raise ValueError(
                 f"{where}tensors: got shape {tensors.shape}; expected (nx, ny, 2, 2) or (nx, ny, nz, 3, 3)"
             )
         for name, value in (("spacing", self.spacing), ("origin", self.origin)):
-            per_axis(f"{where}{name}", value, d)
+            object.__setattr__(self, name, per_axis(f"{where}{name}", value, d))
         if min(self.spacing) <= 0:
             raise ValueError(f"{where}spacing: got {self.spacing}; expected positive numbers")
         if mask is not None and not (isinstance(mask, np.ndarray) and mask.shape == shape and mask.dtype == bool):
@@ -118,8 +121,11 @@ class TensorVolume:
                 raise ValueError(f"{where}{name}: got {unit!r}; expected {known!r} or nothing. Convert the numbers")
         if self.slice_axis not in ((None,) if d == 3 else (None, 0, 1, 2)):
             raise ValueError(f"{where}slice_axis: got {self.slice_axis} for {d} axes; expected 0, 1 or 2 for a slice")
-        if covariance is not None and covariance.shape != (*shape, *[d * (d + 1) // 2] * 2):
-            raise ValueError(f"{where}covariance: got shape {covariance.shape}; expected (*shape, m, m), m = d(d+1)/2")
+        covariance, modes, m = self.covariance, self.modes, d * (d + 1) // 2
+        if covariance is not None and covariance.shape != (*shape, m, m):
+            raise ValueError(f"{where}covariance: got shape {covariance.shape}; expected {(*shape, m, m)}")
+        if modes is not None and (modes.ndim != d + 2 or (*modes.shape[:-2], modes.shape[-1]) != (*shape, m)):
+            raise ValueError(f"{where}modes: got shape {modes.shape}; expected {(*shape, 'n', m)}")
 
     def __repr__(self) -> str:
         inside = "" if self.mask is None else f", mask={int(self.mask.sum())} of {self.mask.size} voxels"

@@ -7,6 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from hks_jax.linear import lapack
@@ -53,6 +54,8 @@ def matrix_function(A: Any, f: Callable[[Array], Any], B: Any = None) -> Float[A
         [[2. 1.]
          [1. 2.]]
     """
+    if not callable(f) or isinstance(f, np.ufunc):
+        raise TypeError(f"f: got {f!r}; expected a function of a JAX scalar, such as jnp.exp")
     a, factor = checked_standard_form(A, B)
     elementwise, parameters, others = _with_parameters(f, a)
     value = _function(elementwise, parameters, others, a)[0]

@@ -121,7 +121,7 @@ def line_integral_convolution(
         >>> image.get_array().shape
         (64, 64, 4)
     """
-    require_plane("field", field.grid)
+    require_plane("field", field)
     if not 0 < contrast <= 1:
         raise ValueError(f"contrast: got {contrast}; expected a number in (0, 1]")
     grid = field.grid

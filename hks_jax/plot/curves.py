@@ -15,8 +15,9 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
+from hks_jax.domain.tensor_checks import require_grid
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.eigenpairs import Eigenpairs, require_pairs
 from hks_jax.eigen.weyl import weyl_count
 from hks_jax.plot.figure import SMALL, number_text
 from hks_jax.plot.panels import checked_times
@@ -62,12 +63,15 @@ def hks_curves(
         >>> np.allclose(line.get_ydata(), signature[:, 4, 4])
         True
     """
+    require_grid(grid)
     t = checked_times(times, grid.shape, values=values, expansion=expansion)
     curves = np.moveaxis(np.asarray(values, dtype=np.float64), 0, -1)
     series = None if expansion is None else np.moveaxis(np.asarray(expansion, dtype=np.float64), 0, -1)
     nodes = _nearest_nodes(np.asarray(points, dtype=np.float64), grid)
     if labels is None:
         labels = ["(" + ", ".join(f"{c:.3g}" for c in grid.nodes[node]) + ")" for node in nodes]
+    if len(labels) != len(nodes):
+        raise ValueError(f"labels: got {len(labels)} labels; expected {len(nodes)}, one per point")
     factor = (4 * math.pi * t) ** (grid.dimension / 2) if scaled else np.ones_like(t)
     colours = colormaps[cmap](np.linspace(0.0, 0.85, len(nodes)))
     ax.set(xscale="log", yscale="linear" if scaled else "log")
@@ -76,13 +80,14 @@ def hks_curves(
         ax.xaxis.set_major_formatter(lambda value, _: number_text(value))
     lines = []
     for node, label, colour in zip(nodes, labels, colours, strict=True):
-        lines += ax.plot(t, factor * curves[node], **{"color": colour, "label": label, **kwargs})
+        style = {"color": colour, "label": label, "marker": "o" if t.size == 1 else "", **kwargs}
+        lines += ax.plot(t, factor * curves[node], **style)
     limits = ax.get_ylim()  # the expansion diverges at large t, so it does not set the limits
     if series is not None:
         for node, line in zip(nodes, lines, strict=True):
             ax.plot(t, factor * series[node], color=line.get_color(), linestyle="--", linewidth=1.0)
     ax.set_ylim(limits)
-    ax.set_xlabel(f"$t${' in ' * bool(unit)}{unit}")
+    ax.set_xlabel(f"$t${f' in {unit}' if unit else ''}")
     power = {2: r"4\pi t\,", 3: r"(4\pi t)^{3/2}\,"}[grid.dimension] if scaled else ""
     ax.set_ylabel(rf"${power}\mathrm{{HKS}}(t)$")
     handles: list[Artist] = list(lines)
@@ -139,7 +144,7 @@ def spectrum(
         >>> print(count.get_ydata().max())
         12.0
     """
-    values = np.asarray(pairs.eigenvalues, np.float64)[np.asarray(pairs.kept)]
+    values = np.asarray(require_pairs(pairs).eigenvalues, np.float64)[np.asarray(pairs.kept)]
     # The staircase N(λ) has a vertical segment at each eigenvalue.
     steps = np.repeat(values, 2)
     count = np.repeat(np.arange(values.size + 1.0), 2)[1:-1]
@@ -156,8 +161,8 @@ def spectrum(
         lines += ax.plot(fine, law, color="black", linewidth=0.9, label="Weyl's law")
     law = weyl_count(pairs, fine) - level(fine)
     lines += ax.plot(fine, law, "--", color="0.5", linewidth=0.9, label=f"Weyl's law, {bulk} alone")
-    ax.set_xlim(0, 1.02 * fine[-1])
-    ax.set_xlabel(rf"$\lambda${' in ' * bool(unit)}{unit}")
+    ax.set_xlim(0, 1.02 * fine[-1] or None)
+    ax.set_xlabel(rf"$\lambda${f' in {unit}' if unit else ''}")
     ax.set_ylabel(r"$N(\lambda)$ minus Weyl's law" if remainder else r"$N(\lambda)$")
     ax.ticklabel_format(scilimits=(-3, 4), useMathText=True)
     ax.tick_params(labelsize=SMALL)

@@ -16,6 +16,8 @@ from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from matplotlib.transforms import ScaledTranslation
 
 from hks_jax.domain.grid import Grid
+from hks_jax.domain.tensor_checks import require_grid
+from hks_jax.domain.tensor_field import require_field
 from hks_jax.storage import atomic_path
 
 SMALL = "small"
@@ -67,8 +69,12 @@ def finished(fig: Figure, suptitle: str, path: str | os.PathLike[str] | None = N
     return fig
 
 
-def require_plane(name: str, grid: Grid) -> None:
-    """Raise ValueError unless the grid is two-dimensional."""
+def require_plane(name: str, domain: Any) -> None:
+    """Raise an error unless the argument `name` is a grid in two dimensions or, if it is "field", a field on one."""
+    if name == "field":
+        require_field(domain)
+    grid = domain.grid if name == "field" else domain
+    require_grid(grid)
     if grid.dimension != 2:
         raise ValueError(
             f"{name}: got a grid of {grid.dimension} dimensions with shape {grid.shape}; expected 2. Draw a slice "

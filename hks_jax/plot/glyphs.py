@@ -58,8 +58,8 @@ def ellipses(
         >>> len(marks.get_offsets())  # one at each node
         81
     """
+    require_plane("field", field)
     grid = field.grid
-    require_plane("field", grid)
     if kind not in ("metric", "tensor"):
         raise ValueError(f'kind: got {kind!r}; expected "metric" or "tensor"')
     if sizes not in ("common", "fit"):
@@ -100,7 +100,7 @@ def ellipses(
         "anisotropy": (anisotropies, "viridis", 1, "anisotropy"),
         "orientation": (angles, "twilight", 180, "orientation in degrees"),
     }
-    if color not in coloured:
+    if not isinstance(color, str) or color not in coloured:
         collection.set_facecolor(color)
         return collection
     values, own, largest, label = coloured[color]

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Colormap
 from matplotlib.image import AxesImage
 
+from hks_jax.checks import require_number, require_real
 from hks_jax.domain.grid import Grid
 from hks_jax.plot.figure import cell_extent, colour_bar, frame, require_plane
 from hks_jax.plot.orientation import Orientation
@@ -136,12 +137,11 @@ def influence_map(
 
 def masked(name: str, values: Any, grid: Grid) -> np.ma.MaskedArray:
     """Return values with a mask where they are not finite or lie outside the grid's mask; raise if all are masked."""
-    if isinstance(values, np.ma.MaskedArray):
-        return values
-    array = np.asarray(values, dtype=np.float64)
+    require_real(name, np.ma.getdata(values))
+    array = np.ma.masked_invalid(np.ma.asarray(values, dtype=np.float64))
     if array.shape != grid.shape:
         raise ValueError(f"{name}: got shape {array.shape}; expected the grid's shape {grid.shape}")
-    masked = np.ma.array(array, mask=~(np.isfinite(array) & grid.inside))
+    masked = np.ma.array(array, mask=np.ma.getmaskarray(array) | ~grid.inside)
     if masked.count() == 0:
         raise ValueError(f"{name}: got no finite value inside the grid's mask; expected at least one")
     return masked
@@ -164,6 +164,12 @@ def colours_of(
     vmax: float | None = None,
 ) -> list[Colours]:
     """Return the colours of each image by the rules of `scalar_image`, with one colour map for all images."""
+    for name, value in (("centre", centre), ("vmin", vmin), ("vmax", vmax)):
+        if value is not None:
+            require_number(name, value, above=-np.inf)
+    require_number("least_range", least_range, inclusive=True)
+    if np.shape(quantiles) != (2,) or not 0 <= quantiles[0] < quantiles[1] <= 1:
+        raise ValueError(f"quantiles: got {quantiles}; expected two increasing numbers from 0 to 1")
     everything = np.concatenate([image.ravel() for image in images])
     if centre is not None and everything.min() >= 0 and np.median(everything) > FAR * centre > 0:
         centre = None
@@ -195,8 +201,8 @@ def panel_colours(
     """
     rules = {name: kwargs.pop(name) for name in RULES if name in kwargs}
     if limits is not None:
-        if len(limits) != len(images):
-            raise ValueError(f"limits: got {len(limits)} pairs; expected {len(images)}, one pair per time")
+        if np.shape(limits) != (len(images), 2):
+            raise ValueError(f"limits: got shape {np.shape(limits)}; expected {(len(images), 2)}, a pair per time")
         return [{**kwargs, "vmin": low, "vmax": high} for low, high in limits]
     values = [image.compressed() for image in images]
     colours = colours_of([np.concatenate(values)], **rules) * len(values) if shared else colours_of(values, **rules)

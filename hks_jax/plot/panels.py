@@ -11,6 +11,8 @@ from jaxtyping import Float, Real
 from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 
+from hks_jax.arrays import describe_array
+from hks_jax.checks import require_real
 from hks_jax.domain.grid import Grid
 from hks_jax.plot.figure import SMALL, finished, new_figure, number_text, panel_size, require_plane
 from hks_jax.plot.images import masked, panel_colours, scalar_image
@@ -58,9 +60,9 @@ def hks_panels(
         ['$t$ = 0.2', '$t$ = 0.5']
     """
     require_plane("grid", grid)
-    t = checked_times(times, grid.shape, values=values)
+    t = checked_times(times, grid.shape, values=values, z=z)
     titles = panel_titles(t, titles, unit)
-    images = [masked("values", v, grid) for v in np.asarray(values)]
+    images = [masked("values", v, grid) for v in np.ma.asarray(values)]
     colours = panel_colours(images, limits, shared_range, **kwargs)
     rows = math.ceil(t.size / 4)
     columns = math.ceil(t.size / rows)
@@ -109,14 +111,14 @@ def time_rows(
         2
     """
     require_plane("grid", grid)
-    if not rows:
-        raise ValueError("rows: got no scalars; expected at least one")
+    if not isinstance(rows, Mapping) or not rows:
+        raise ValueError(f"rows: got {describe_array(rows)}; expected a dictionary of at least one scalar by name")
     t = checked_times(times, grid.shape, **{f"rows: {name}": values for name, values in rows.items()})
     width, height = panel_size(grid, 1.9)
     figure = new_figure(t.size * (width + 0.65) + 0.6, len(rows) * (height + 0.2) + 0.5 + 0.3 * bool(suptitle))
     panels = figure.subplots(len(rows), t.size, squeeze=False)
     for line, (name, values) in zip(panels, rows.items(), strict=True):
-        images = [masked(f"rows: {name}", each, grid) for each in np.asarray(values)]
+        images = [masked(f"rows: {name}", each, grid) for each in np.ma.asarray(values)]
         own = cmap[name] if isinstance(cmap, Mapping) else cmap
         colours = panel_colours(images, shared=shared_range, cmap=own, quantiles=quantiles)
         for ax, image, style in zip(line, images, colours, strict=True):
@@ -130,6 +132,7 @@ def time_rows(
 
 def checked_times(times: Any, shape: tuple[int, ...], **arrays: Any) -> Float[np.ndarray, " n_times"]:
     """Return the times; raise ValueError unless each array has one value per time and node, for at least one time."""
+    require_real("times", times)
     t = np.atleast_1d(np.asarray(times, dtype=np.float64))
     for name, array in arrays.items():
         if array is not None and (np.shape(array) != (t.size, *shape) or t.ndim != 1 or t.size == 0):
@@ -143,7 +146,7 @@ def checked_times(times: Any, shape: tuple[int, ...], **arrays: Any) -> Float[np
 def panel_titles(t: Float[np.ndarray, " n_times"], titles: Sequence[str] | None, unit: str) -> Sequence[str]:
     """Return a title for each time; raise ValueError if the number of titles differs from the number of times."""
     if titles is None:
-        return [f"$t$ = {number_text(s)} {unit}".rstrip() for s in t]
+        return [f"$t$ = {number_text(s)} {unit or ''}".rstrip() for s in t]
     if len(titles) != t.size:
         raise ValueError(f"titles: got {len(titles)} titles; expected {t.size}, one per time")
     return titles

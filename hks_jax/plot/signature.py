@@ -59,6 +59,8 @@ def signature_panels(
         >>> len(hj.plot.signature_panels(result).axes)
         2
     """
+    if not isinstance(result, Result):
+        raise TypeError(f"result: got {type(result).__name__}; expected hks_jax.io.Result, as Result.read returns it")
     volume, inside = result.volume, np.isfinite(result.values[0])
     grid, box = cropped(volume, inside)
     colours = _colours(result, inside)

@@ -15,6 +15,7 @@ from matplotlib.colors import Colormap, Normalize
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
+from hks_jax.checks import require_real
 from hks_jax.domain.components import active_elements
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.simplicial_mesh import SurfaceMesh, TetMesh
@@ -63,6 +64,11 @@ def surface(
         >>> hj.plot.surface(ax, sphere, sphere.vertices[:, 2]).get_clim()
         (-1.0, 1.0)
     """
+    if not hasattr(ax, "add_collection3d"):
+        raise TypeError('ax: got axes in two dimensions; expected fig.add_subplot(projection="3d")')
+    if not isinstance(mesh, SurfaceMesh | TetMesh):
+        raise TypeError(f"mesh: got {type(mesh).__name__}; expected hks_jax.SurfaceMesh or hks_jax.TetMesh")
+    require_real("values", values)
     scalars = np.asarray(values, dtype=np.float64)
     if scalars.shape != (len(mesh.vertices),):
         raise ValueError(f"values: got shape {scalars.shape}; expected ({len(mesh.vertices)},), one per vertex")

@@ -4,6 +4,7 @@ Eigenvectors have no sign, so tensors instead of eigenvectors are interpolated b
 direction at a point follows from the interpolated tensor in closed form, and its sign from the previous direction.
 """
 
+import math
 from typing import Any, Literal
 
 import numpy as np
@@ -13,6 +14,7 @@ from matplotlib.collections import LineCollection
 from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial import cKDTree
 
+from hks_jax.checks import real_array
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.plot.figure import frame, require_plane, side_in_inches
 
@@ -30,7 +32,7 @@ class DirectionField:
     """
 
     def __init__(self, field: TensorField, which: Which) -> None:
-        require_plane("field", field.grid)
+        require_plane("field", field)
         if which not in ("major", "minor"):
             raise ValueError(f'which: got {which!r}; expected "major" or "minor"')
         grid = field.grid
@@ -86,7 +88,8 @@ def trace(
         >>> print(np.ptp(np.hypot(*(line + 0.3).T)) < 0.01)  # an arc of a circle about (−0.3, −0.3)
         True
     """
-    points = np.asarray(seeds, dtype=np.float64)
+    require_plane("field", field)
+    points = np.asarray(real_array("seeds", seeds), dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2:
         raise ValueError(f"seeds: got shape {points.shape}; expected (n, 2)")
     forward, backward = _both_ways(DirectionField(field, which), points, *_lengths(field, step, max_length))
@@ -116,7 +119,8 @@ def evenly_spaced_lines(
         >>> print(max(np.ptp(np.hypot(*(line + 0.3).T)) for line in lines) < 0.01)  # arcs of circles
         True
     """
-    if not separation > 0:
+    require_plane("field", field)
+    if not 0 < separation < math.inf:
         raise ValueError(f"separation: got {separation}; expected a positive length, in the unit of the coordinates")
     h, n_steps = _lengths(field, None, None)
     h = min(h, separation / 4)
@@ -207,7 +211,7 @@ def _lengths(field: TensorField, step: float | None, max_length: float | None) -
     h = 0.5 * min(grid.spacing) if step is None else step
     side = max((n - 1) * s for n, s in zip(grid.shape, grid.spacing, strict=True))
     length = 8.0 * side if max_length is None else max_length
-    if not (h > 0 and length > 0):
+    if not (0 < h < math.inf and 0 < length < math.inf):
         raise ValueError(f"step, max_length: got {step}, {max_length}; expected positive lengths in coordinate units")
     return h, max(1, int(np.ceil(0.5 * length / h)))
 
@@ -250,7 +254,7 @@ def integral_lines(
         >>> len(lines.get_segments())
         2
     """
-    require_plane("field", field.grid)
+    require_plane("field", field)
     if seeds is None:
         if not density > 0:
             raise ValueError(f"density: got {density}; expected a positive number")

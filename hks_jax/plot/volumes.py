@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from hks_jax.domain.grid import Grid
+from hks_jax.domain.tensor_checks import require_grid
 from hks_jax.plot.figure import SMALL, colour_bar_in, finished, new_figure
 from hks_jax.plot.images import masked, panel_colours, scalar_image
 from hks_jax.plot.orientation import Orientation
@@ -145,9 +146,9 @@ def volume_panels(
         8
     """
     require_volume(grid)
-    t = checked_times(times, grid.shape, values=values)
+    t = checked_times(times, grid.shape, values=values, z=z)
     titles = panel_titles(t, titles, unit)
-    volumes = [masked("values", each, grid) for each in np.asarray(values)]
+    volumes = [masked("values", each, grid) for each in np.ma.asarray(values)]
     noise = [None] * t.size if z is None else np.asarray(z)
     colours = panel_colours(volumes, limits, **kwargs)
     _, shown, chosen = _turned(volumes[0], grid, node, orientation)
@@ -184,6 +185,7 @@ def volume_panels(
 
 def require_volume(grid: Grid) -> None:
     """Raise ValueError unless the grid is three-dimensional."""
+    require_grid(grid)
     if grid.dimension != 3:
         raise ValueError(f"grid: got shape {grid.shape}; expected three dimensions. Use hks_panels for two dimensions")
 
@@ -193,6 +195,8 @@ def _turned(
 ) -> tuple[np.ma.MaskedArray, Grid, tuple[int, ...]]:
     """Return the values, the grid and the nearest node with a value along the axes of the image."""
     if node is not None:
+        if np.shape(node) != (3,):
+            raise ValueError(f"node: got {node!r}; expected three indices")
         nodes = np.argwhere(~np.ma.getmaskarray(array))
         node = nodes[np.argmin(np.sum((nodes - np.asarray(node)) ** 2, axis=1))].tolist()
     if orientation is not None:

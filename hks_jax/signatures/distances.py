@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.arrays import nan_is_meant, nan_outside
-from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.eigenpairs import Eigenpairs, require_pairs
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.signatures.filters import Filter, Heat, Power
 from hks_jax.signatures.spectral_functions import (
@@ -58,6 +58,7 @@ def biharmonic_distance(pairs: Eigenpairs, sources: Any) -> Float[Array, "n_sour
         >>> print(d[0, 0, 0], jnp.isclose(d[0, 8, 8], d[1, 0, 0]))  # to itself; there and back
         0.0 True
     """
+    require_pairs(pairs)
     known = pairs.null_space_known or not is_traced(jax.lax.stop_gradient(pairs.eigenvalues))
     if known and pairs.n_null > 1:
         raise ValueError(
@@ -83,7 +84,7 @@ def shape_dna(pairs: Eigenpairs, normalise: bool = True) -> Float[Array, " k"]:
         >>> np.allclose(hj.shape_dna(nine), hj.shape_dna(pairs), atol=1e-2)
         True
     """
-    values = pairs.eigenvalues
+    values = require_pairs(pairs).eigenvalues
     if normalise:
         dimension = dimension_of(pairs, "normalised ShapeDNA")
         values = values * volume_of(pairs, "normalised ShapeDNA") ** (2 / dimension)

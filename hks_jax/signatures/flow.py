@@ -10,8 +10,8 @@ import scipy
 from jaxtyping import Array, Float
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.checks import checked_times, require_real
-from hks_jax.domain.tensor_field import TensorField
+from hks_jax.checks import checked_times, real_array, require_real
+from hks_jax.domain.tensor_field import TensorField, require_field
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Heat
 from hks_jax.signatures.spectral_functions import spectral_flow
@@ -44,8 +44,7 @@ def heat_flow(pairs: Eigenpairs, times: Any, functions: Any) -> Float[Array, "n_
         [1.0, 1.0]
     """
     times, shape = times_of(pairs, times), pairs.space.node_shape
-    require_real("functions", functions)
-    u = jnp.asarray(functions, times.dtype)
+    u = real_array("functions", functions).astype(times.dtype)
     if u.shape[u.ndim - len(shape) :] != shape:
         raise ValueError(f"functions: got shape {u.shape}; expected {shape}, with optional leading axes")
     if not is_traced(u):
@@ -97,11 +96,7 @@ def tensor_invariants(field: TensorField) -> dict[str, Float[np.ndarray, "*shape
         >>> {name: round(float(values[4, 4]), 3) for name, values in hj.tensor_invariants(field).items()}
         {'trace': 5.0, 'determinant': 4.0, 'anisotropy': 0.6}
     """
-    if not isinstance(field, TensorField):
-        raise TypeError(
-            f"field: got {type(field).__name__}; expected hks_jax.TensorField. For an array T (*shape, d, d), pass "
-            "TensorField(Grid(shape), T)"
-        )
+    require_field(field)
     tensors = np.asarray(field.domain_tensors, np.float64)
     d = field.grid.dimension
     trace = np.trace(tensors, axis1=-2, axis2=-1)
@@ -133,6 +128,7 @@ def gaussian_scale_space(
         >>> print(blurred.min().round(3), blurred.max().round(3))
         1.0 1.0
     """
+    require_field(field)
     grid, d = field.grid, field.grid.dimension
     require_real("functions", functions)
     t, u = np.asarray(checked_times(times, float)), np.asarray(functions, np.float64)

@@ -286,7 +286,7 @@ def boundary_influence(
 
 def _glued(domain: TensorField | SimplicialMesh, boundary: BoundarySpec) -> BoundarySpec:
     """Return the boundary conditions with "mean" on every side that is not periodic."""
-    if isinstance(domain, SimplicialMesh):
+    if not isinstance(domain, TensorField):
         if boundary not in ("neumann", "mean"):
             raise ValueError(f'boundary: got {boundary!r}; expected "neumann" for a mesh')
         return "mean"

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hks_jax.checks import require_number, require_real
+from hks_jax.checks import require_count, require_number, require_real
 from hks_jax.compilation import numpy_where_known
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Custom, Derivative, Heat, Wave
@@ -74,6 +74,8 @@ def scale_invariant_hks(
         >>> np.allclose(hj.scale_invariant_hks(nine), hj.scale_invariant_hks(pairs), atol=1e-3)
         True
     """
+    for name, count in (("n_frequencies", n_frequencies), ("n_times", n_times)):
+        require_count(name, count)
     if times is None:
         first, last = positive_range(pairs)
         times = 4 * math.log(10.0) / jnp.geomspace(last, first, n_times)

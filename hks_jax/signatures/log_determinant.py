@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hks_jax.accuracy import warn_of_accuracy
+from hks_jax.checks import require_number
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.linear.divided_differences import gauss
 from hks_jax.signatures.times import dimension_of, positive_range, require_pairs, volume_of
@@ -75,6 +76,10 @@ def heat_coefficients(
     angles = np.asarray(corners, float)
     if not ((angles > 0) & (angles <= 2 * math.pi)).all():
         raise ValueError(f"corners: got {corners}; expected inner angles in radians, above 0 and at most 2π")
+    if condition not in ("neumann", "dirichlet"):
+        raise ValueError(f'condition: got {condition!r}; expected "neumann" or "dirichlet"')
+    require_number("euler_characteristic", euler_characteristic, above=-math.inf)
+    require_number("boundary_length", boundary_length, inclusive=True)
     area = volume_of(pairs, "the heat trace")
     length = jnp.asarray(boundary_length, area.dtype) * (1 if condition == "neumann" else -1)
     constant = euler_characteristic / 6 + float(((math.pi - angles) ** 2 / (24 * math.pi * angles)).sum())

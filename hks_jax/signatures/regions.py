@@ -57,8 +57,8 @@ def region_statistics(values: Any, labels: Any, node_volume: float = 1.0) -> Reg
     u, regions = np.asarray(values, np.float64), np.asarray(labels)
     if u.ndim < 2 or u.shape[1:] != regions.shape:
         raise ValueError(f"labels: got shape {regions.shape}; expected the values' shape without times, {u.shape[1:]}")
-    if not np.array_equal(regions, np.rint(regions)):
-        raise ValueError("labels: got fractional numbers; expected integers, 0 for no region")
+    if not (np.isfinite(regions).all() and np.array_equal(regions, np.rint(regions))):
+        raise ValueError("labels: got fractional numbers or infinity; expected integers, 0 for no region")
     u, regions = u.reshape(len(u), -1), regions.ravel().astype(np.int64)
     inside = np.isfinite(u[0])
     if not np.array_equal(np.isfinite(u), np.broadcast_to(inside, u.shape)):

@@ -12,21 +12,10 @@ from jaxtyping import Array, Bool, Float
 from hks_jax.checks import checked_times, require_count, require_number
 from hks_jax.compilation import numpy_where_known
 from hks_jax.domain.components import label_nodes
-from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.eigenpairs import Eigenpairs, require_pairs
 from hks_jax.eigen.weyl import weyl, weyl_number
 from hks_jax.fem.boundary import BoundarySpec, doubled_problems, normalise_boundary
 from hks_jax.traced import is_traced
-
-
-def require_pairs(pairs: Eigenpairs) -> Eigenpairs:
-    """Return the pairs; raise TypeError or ValueError unless they are eigenpairs of one domain."""
-    if not isinstance(pairs, Eigenpairs):
-        raise TypeError(f"pairs: got {type(pairs).__name__}; expected the result of `eigenpairs`")
-    if pairs.eigenvalues.ndim != 1:
-        raise ValueError(
-            f"pairs: got a batch with eigenvalues of shape {pairs.eigenvalues.shape}; expected (k,). Use jax.vmap"
-        )
-    return pairs
 
 
 def times_of(pairs: Eigenpairs, times: Any) -> Float[Array, " n"]:
@@ -112,9 +101,8 @@ def default_energies(pairs: Eigenpairs, n: int = 100) -> tuple[Float[Array, " n"
         >>> print(jnp.isclose(energies[0], jnp.log(pairs.eigenvalues[1]) + 2 * sigma))
         True
     """
-    if n < 29:
-        raise ValueError(f"n: got {n}; expected at least 29, so that the range of energies exceeds 4σ")
-    if _n_positive(pairs) < 2:
+    require_count("n", n, 29)  # fewer energies would not exceed the range 4σ
+    if _n_positive(require_pairs(pairs)) < 2:
         raise ValueError(
             f"pairs: got {_n_positive(pairs)} positive eigenvalue(s); expected at least two. Compute more eigenpairs"
         )

@@ -56,6 +56,8 @@ class TensorNoise(eqx.Module):
     def __check_init__(self) -> None:
         grid = self.grid
         require_number("correlation", self.correlation, inclusive=True)
+        if not self.freedom > 0:
+            raise ValueError(f"freedom: got {self.freedom}; expected a positive number of degrees of freedom")
         shape = self.covariance.shape
         if len(shape) < 3 or shape[-1] != shape[-2] or shape[-1] not in (3, 6):
             raise ValueError(

@@ -104,5 +104,5 @@ def test_near_points_merge_as_asked():
 def test_errors():
     with pytest.raises(ValueError, match=r"field: got a grid of shape \(3, 3, 3\); expected 2 dimensions"):
         hj.degenerate_points(hj.TensorField(hj.Grid((3, 3, 3)), np.broadcast_to(np.eye(3), (3, 3, 3, 3, 3))))
-    with pytest.raises(ValueError, match="merge: got 0; expected at least 1"):
+    with pytest.raises(ValueError, match="merge: got 0; expected an integer of at least 1"):
         hj.degenerate_points(hj.examples.degenerate_point_field(0.5, 9), merge=0)

@@ -74,7 +74,7 @@ def test_neighbouring_nodes_without_a_common_element_are_not_connected():
         ({"shape": (4,)}, "shape: got .* expected 2 or 3 axes"),
         ({"shape": (3.7, 4)}, r"shape: got \(3.7, 4\); expected a tuple of 2 or 3 integers"),
         ({"shape": 5}, "shape: got 5; expected a tuple"),
-        ({"shape": (4, 4), "spacing": "wide"}, "spacing: got 'wide'; expected 2 numbers"),
+        ({"shape": (4, 4), "spacing": "wide"}, "spacing: got 'wide'; expected an array of numbers"),
         ({"shape": (4, 1)}, "at least 2 nodes"),
         ({"shape": (4, 4), "spacing": (1, 2, 3)}, "spacing: got .*; expected 2 finite numbers"),
         ({"shape": (4, 4), "spacing": (1, -2)}, "spacing: .* expected positive"),

@@ -1,5 +1,7 @@
 """Fits of metrics to signatures."""
 
+import pickle
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,9 +23,9 @@ from hks_jax.inverse import (
     identifiability,
     wave_kernel,
 )
-from hks_jax.inverse.observation import observe
+from hks_jax.inverse.observation import LOSSES, observe
 from hks_jax.inverse.problem import Problem, more_pairs, outcome_of, truncation_shows
-from hks_jax.inverse.signature import pairs_for
+from hks_jax.inverse.signature import SIGNATURES, pairs_for
 from hks_jax.inverse.unknowns import PARAMETRISATIONS, Nodal
 
 N = 10
@@ -582,3 +584,12 @@ def test_solvers_of_optimistix_are_taken_as_they_are():
     assert [step.step for step in fit.history] == list(range(len(fit.history)))
     assert len({step.loss for step in fit.history}) == len(fit.history)
     assert min(step.loss for step in fit.history) == pytest.approx(fit.loss, rel=1e-12)
+
+
+def test_fits_can_be_pickled_with_every_named_setting():
+    problem = problem_of(signature(FLAT), TIMES, FLAT, K)
+    settings = LOSSES, SIGNATURES, PARAMETRISATIONS, problem
+    again = pickle.loads(pickle.dumps(settings))
+    assert [list(table) for table in again[:3]] == [list(table) for table in settings[:3]]
+    assert again[0]["relative"](jnp.array(3.0), jnp.array(2.0)) == 0.5
+    assert again[2]["rotation"].start(jnp.ones((5, 3, 3))).shape == (5, 3)

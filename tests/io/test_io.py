@@ -316,7 +316,7 @@ def test_erosion_peels_the_rim_but_not_the_border_of_the_image():
     assert erode(mask, 0) is mask
     with pytest.raises(ValueError, match="removes all 98 voxels"):
         erode(mask, 4)
-    with pytest.raises(ValueError, match="expected 0 or more"):
+    with pytest.raises(ValueError, match="iterations: got -1; expected an integer of at least 0"):
         erode(mask, -1)
 
 
@@ -611,3 +611,34 @@ def test_a_result_on_a_mesh_has_no_volume(tmp_path):
     assert (read.settings, read.unit) == ({}, "")
     with pytest.raises(ValueError, match=r"hks\.npz: got a result on a mesh"):
         read.volume  # noqa: B018
+
+
+def test_what_a_file_cannot_hold_is_refused(tmp_path):
+    volume = hj.io.TensorVolume(np.broadcast_to(np.eye(2), (4, 3, 2, 2)), (1.0, 2.0), (0.0, 0.0))
+    values, path = np.ones((4, 3)), tmp_path / "values.npz"
+    for given, options, message in (
+        (values, {"name": "mask"}, "name: got 'mask', which is the name of another array"),
+        (values, {"extra": {"values": values}}, "name: got 'values', which is the name of another array"),
+        (values, {"extra": {"fit": None}}, "fit: got Python objects for an npz"),
+        (np.ma.array(values, mask=np.eye(4, 3)), {}, "values: got a masked array"),
+        (values + 1j, {}, "values: got complex numbers"),
+    ):
+        with unchecked(), pytest.raises(ValueError, match=f"^{message}"):
+            hj.io.save(path, given, volume, **options)
+    assert not path.exists()
+
+
+def test_results_and_volumes_take_lists_and_check_shapes(tmp_path):
+    with unchecked():
+        volume = hj.io.TensorVolume(np.broadcast_to(np.eye(2), (4, 3, 2, 2)).tolist(), 2, [0, 0])
+        assert volume.spacing == (2.0, 2.0)
+        assert volume.tensors.dtype == np.float64
+        result = hj.io.Result(volume, np.ones((2, 4, 3)).tolist(), [1, 2], arrays={"bias": np.ones((2, 4, 3))})
+        result.save(tmp_path / "hks", ".nii")
+        assert set(hj.io.Result.read(tmp_path / "hks.npz").arrays) == {"bias", "input_tensors"}
+        with pytest.raises(ValueError, match=r"values: got shape \(4, 3\) and times of shape \(1,\); expected"):
+            hj.io.Result(volume, np.ones((4, 3)), [1])
+        with pytest.raises(ValueError, match=r"modes: got shape \(4, 3, 3\)"):
+            hj.io.TensorVolume(volume.tensors, (1, 1), (0, 0), modes=np.ones((4, 3, 3)))
+        mask = hj.io.read_tensors(hj.io.save_tensors(tmp_path / "t.npz", volume), mask=[[1, 1, 0]] * 4).mask
+        assert mask.sum() == 8

@@ -470,3 +470,15 @@ def test_a_surface_is_turned_and_its_vertices_are_chosen(browser, tmp_path):
     inside = (np.hypot(vertices[:, 0], vertices[:, 1]) < 0.4) & (vertices[:, 2] > 0)
     assert abs(int(browser.text("#region-text").split()[0]) - inside.sum()) <= 2
     assert browser.problems == []
+
+
+def test_maps_and_labels_that_the_page_cannot_hold_are_refused(tmp_path):
+    known, hidden = of(signature()), np.ma.array(np.ones(SHAPE), mask=np.eye(*SHAPE))
+    for result, given, words in (
+        (known, {"maps": {"a": np.ones(SHAPE) + 1j}}, "maps['a']: got complex numbers"),
+        (known, {"maps": {"a": hidden}}, "maps['a']: got a masked array"),
+        (known, {"labels": np.full(SHAPE, 2**40)}, "labels: got 1099511627776"),
+        (known.values, {}, "result: got ndarray; expected hks_jax.io.Result"),
+    ):
+        with unchecked(), pytest.raises((TypeError, ValueError), match=f"^{re.escape(words)}"):
+            explore(result, tmp_path / "page.html", **given)

@@ -187,7 +187,7 @@ def test_rows_over_time():
     assert own.axes[1].images[0].get_clim() == (rows["HKS"][1, :5].min(), rows["HKS"][1, :5].max())
     with pytest.raises(ValueError, match=r"rows: HKS: got shape \(3, 6, 4\).*; expected .* \(2, 6, 4\)"):
         plot.time_rows(rows, [0.1, 1], grid)
-    with pytest.raises(ValueError, match="rows: got no scalars"):
+    with pytest.raises(ValueError, match=r"rows: got \{\}; expected a dictionary"):
         plot.time_rows({}, [0.1], grid)
 
 

@@ -22,6 +22,7 @@ from hks_jax.plot import (
     sensitivity,
     signature_panels,
     surface,
+    time_rows,
     trace,
 )
 from hks_jax.plot.glyphs import FILL
@@ -485,3 +486,34 @@ def test_pictures_of_a_signature_name_it_and_the_distance_of_diffusion(normalisa
     assert figure.get_suptitle() == f"{title}, metric D⁻¹"
     titles = [ax.get_title() for ax in figure.axes]
     assert titles == ["$t$ = 2 s\n$\\sqrt{Dt}$ = 2 mm", "$t$ = 8 s\n$\\sqrt{Dt}$ = 4 mm"]
+
+
+def test_masked_values_stay_hidden_and_rules_without_meaning_are_refused():
+    grid, times = Grid((3, 2)), [0.5, 2.0]
+    values = np.ma.array(np.arange(12.0).reshape(2, 3, 2), mask=np.arange(12).reshape(2, 3, 2) % 6 == 5)
+    values.data[values.mask] = 1e6
+    with unchecked():
+        figures = hks_panels(values, times, grid, unit=None), time_rows({"HKS": values}, times, grid)
+    for figure in figures:
+        assert [ax.images[0].get_clim() for ax in figure.axes[:2]] == [(0, 4), (6, 10)]
+        assert [ax.get_title() for ax in figure.axes[:2]] == ["$t$ = 0.5", "$t$ = 2"]
+    for rules, message in (
+        ({"quantiles": (0.9, 0.1)}, "quantiles: got"),
+        ({"vmin": np.nan}, "vmin: got nan"),
+        ({"centre": "1"}, "centre: got"),
+        ({"z": np.zeros((3, 3, 2))}, r"z: got shape \(3, 3, 2\)"),
+        ({"limits": (0, 1)}, r"limits: got shape \(2,\); expected \(2, 2\)"),
+    ):
+        with unchecked(), pytest.raises(ValueError, match=f"^{message}"):
+            hks_panels(values.filled(1.0), times, grid, **rules)
+    with unchecked(), pytest.raises(ValueError, match="values: got complex numbers"):
+        hks_panels(values.filled(1.0) + 1j, times, grid)
+
+
+def test_a_curve_of_one_time_is_a_mark():
+    grid = Grid((3, 3))
+    ax = new_figure(3, 3).subplots()
+    (line,) = hks_curves(ax, np.ones((1, 3, 3)), [0.5], grid, [(1, 1)])
+    assert line.get_marker() == "o"
+    with pytest.raises(ValueError, match="labels: got 2 labels; expected 1"):
+        hks_curves(ax, np.ones((1, 3, 3)), [0.5], grid, [(1, 1)], labels=["A", "B"])

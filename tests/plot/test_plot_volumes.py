@@ -99,7 +99,7 @@ def test_errors():
         volume_panels(np.zeros((1, 3, 3)), [1.0], Grid((3, 3)))
     with unchecked(), pytest.raises(ValueError, match=r"values: got shape .* expected \(n_times, \*shape\)"):
         volume_panels(ramp(), [1.0], GRID)
-    with pytest.raises(ValueError, match="limits: got 2 pairs; expected 1"):
+    with pytest.raises(ValueError, match=r"limits: got shape \(2, 2\); expected \(1, 2\)"):
         volume_panels(ramp()[None], [1.0], GRID, limits=[(0, 1)] * 2)
     with pytest.raises(ValueError, match="axes: got 1 axes; expected 3"):
         orthogonal_slices(new_figure(3, 3).subplots(1, 1, squeeze=False)[0], ramp(), GRID)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy
 from annotations import unchecked
 
 import hks_jax as hj
@@ -151,3 +152,69 @@ COMPLEX = {
 def test_complex_numbers_are_refused(case):
     with pytest.raises(ValueError, match=f"^{case.split()[0]}: got complex numbers; expected real numbers"):
         COMPLEX[case]()
+
+
+def test_other_objects_than_arrays_fields_and_eigenpairs_are_named_with_a_remedy():
+    path, ax, mesh = "tensors.nii", hj.plot.new_figure(1, 1).add_subplot(), hj.examples.sphere_mesh(1)
+    matrix = scipy.sparse.csr_array(np.eye(3))
+    calls = [
+        (lambda: hj.TensorField(GRID, path), "tensors: got 'tensors.nii'; expected an array of numbers. Read the file"),
+        (lambda: hj.TensorField(GRID, VOLUME), "tensors: got .*; expected an array of numbers. Pass its .tensors"),
+        (lambda: hj.TensorField(GRID, None), "tensors: got None; expected an array of numbers"),
+        (lambda: hj.TensorField.from_function(GRID, np.eye), "grid: got function; expected hks_jax.Grid"),
+        (lambda: hj.TensorField.from_function(GRID, GRID), "fn: got Grid; expected a function from coordinates"),
+        (lambda: hj.Grid((4, 5), mask=np.ma.array(np.ones((4, 5)), mask=np.eye(4, 5))), "mask: got a masked array"),
+        (
+            lambda: hj.SurfaceMesh(mesh, mesh.faces),
+            "vertices: got .*; expected .*. Pass its .vertices",
+        ),
+        (lambda: hj.eigh(matrix), r"A: got .*; expected an array of numbers. Pass its .todense\(\)"),
+        (lambda: hj.eigenpairs(FIELD.tensors), r"K: got shape .* For tensors, pass TensorField\(grid, tensors\)"),
+        (lambda: hj.eigenpairs(FIELD, interval=3.0), r"interval: got shape \(\); expected the ends \(a, b\)"),
+        (lambda: hj.eigenpairs(FIELD, 3, solver=["dense"]), r"solver: got \['dense'\]; expected \"auto\""),
+        (lambda: hj.assemble(FIELD, fields=path), "fields: got 'tensors.nii'; expected a dictionary"),
+        (lambda: hj.matrix_function(np.eye(2), np.exp), "f: got .*; expected a function of a JAX scalar"),
+        (lambda: hj.crop(np.ones(4), GRID), r"values: got shape \(4,\); expected at least 2 axes"),
+        (lambda: hj.boundary_influence(VOLUME, [1.0], 3), "domain: got TensorVolume; expected a TensorField"),
+        (lambda: hj.weyl_count(FIELD, [1.0]), "problem: got TensorField; expected the result of `eigenpairs`"),
+        (lambda: hj.weyl_count(pairs(), [1.0], GRID), "domain: got Grid; expected a TensorField or a mesh"),
+        (lambda: hj.plot.trace(GRID, [[0, 0]]), "field: got Grid; expected hks_jax.TensorField"),
+        (lambda: hj.plot.scalar_image(ax, np.ones((4, 5)), FIELD), "grid: got TensorField; expected hks_jax.Grid"),
+        (lambda: hj.plot.volume_panels(np.ones((1, 4, 5)), [1.0], VOLUME), "grid: got TensorVolume.*volume.grid"),
+        (lambda: hj.plot.time_rows(np.ones((1, 4, 5)), [1.0], GRID), "rows: got float64 .*; expected a dictionary"),
+        (lambda: hj.plot.surface(ax, mesh, np.ones(12)), "ax: got axes in two dimensions; expected .*3d"),
+        (lambda: hj.plot.signature_panels(path), "result: got str; expected hks_jax.io.Result"),
+        (lambda: hj.io.save(path, np.ones((4, 5)), GRID), "volume: got Grid; expected a TensorVolume or a mesh"),
+        (lambda: hj.io.save_tensors(path, FIELD), "volume: got TensorField; expected a TensorVolume"),
+        (lambda: hj.io.Result(GRID, np.ones((1, 4, 5)), [1.0]), "place: got Grid; expected a TensorVolume or a mesh"),
+    ]
+    field_functions = (hj.scalar_curvature, hj.gaussian_curvature, hj.degenerate_points, hj.tensor_invariants)
+    calls += [(lambda f=f: f(VOLUME), "field: got TensorVolume; expected hks_jax.TensorField") for f in field_functions]
+    pair_functions = (hj.shape_dna, hj.default_energies, lambda p: hj.biharmonic_distance(p, [(0, 0)]))
+    calls += [(lambda f=f: f(FIELD), "pairs: got TensorField; expected the result of") for f in pair_functions]
+    for call, message in calls:
+        with pytest.raises((TypeError, ValueError), match=f"^{message}"):
+            call()
+
+
+def test_settings_without_meaning_are_refused():
+    known = pairs()
+    batch = jax.tree.map(lambda x: jnp.stack([x, x]), known)
+    calls = [
+        (batch.summary, r"pairs: got a batch with eigenvalues of shape \(2, 5\)"),
+        (lambda: hj.weyl_count(batch, [1.0]), r"pairs: got a batch with eigenvalues of shape \(2, 5\)"),
+        (lambda: hj.heat_coefficients(known, 1, condition="Neumann"), "condition: got 'Neumann'; expected \"neumann\""),
+        (lambda: hj.heat_coefficients(known, NAN), "euler_characteristic: got nan"),
+        (lambda: hj.heat_coefficients(known, 1, -1.0), "boundary_length: got -1.0"),
+        (lambda: hj.scale_invariant_hks(known, 2.5), "n_frequencies: got 2.5"),
+        (lambda: hj.reflect(FIELD, 1.5), "width: got 1.5"),
+        (lambda: hj.TensorNoise(np.ones((4, 5, 3, 3)), freedom=-1.0), "freedom: got -1.0"),
+        (lambda: hj.region_statistics(np.ones((1, 4)), np.full(4, INF)), "labels: got fractional numbers or infinity"),
+        (lambda: hj.plot.evenly_spaced_lines(FIELD, separation=INF), "separation: got inf"),
+        (lambda: hj.io.erode(np.full((4, 4), 0.5)), "mask: got dtype float64 with values other than 0 and 1"),
+    ]
+    for call, message in calls:
+        with pytest.raises(ValueError, match=f"^{message}"):
+            call()
+    with pytest.raises(AttributeError, match=r"spacing: a grid cannot be changed"):
+        GRID.spacing = (2.0, 2.0)

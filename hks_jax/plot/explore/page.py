@@ -15,6 +15,7 @@ from jaxtyping import Bool, Real
 from matplotlib import colormaps
 
 from hks_jax import __version__
+from hks_jax.checks import require_real
 from hks_jax.domain.simplicial_mesh import SurfaceMesh, TetMesh
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result
@@ -81,6 +82,8 @@ def explore(
         >>> page.read_text(encoding="utf-8")[:15]
         '<!doctype html>'
     """
+    if not isinstance(result, Result):
+        raise TypeError(f"result: got {type(result).__name__}; expected hks_jax.io.Result, as Result.read returns it")
     mesh, noise = result.place, result.arrays.get("deviation")
     if isinstance(mesh, TetMesh):
         raise ValueError(f"{result.source}: got a result on tetrahedra; expected a grid or a surface. Use ParaView")
@@ -105,6 +108,7 @@ def explore(
     for name, values in (maps or {}).items():
         if np.shape(values) != inside.shape:
             raise ValueError(f"maps[{name!r}]: got shape {np.shape(values)}; expected the grid's shape {inside.shape}")
+        require_real(f"maps[{name!r}]", values)
         layers[name] = np.asarray(values)[inside]
     size = 4 * (int(inside.sum()) * t.size * (2 if noise is not None else 1) + sum(map(np.size, layers.values())))
     if size > LIMIT:
@@ -198,6 +202,8 @@ def _regions(
     labels: Real[ArrayLike, "*shape"], names: Mapping[int, str] | None, inside: Bool[np.ndarray, "*shape"]
 ) -> tuple[str, dict[int, str]]:
     found = region_statistics(np.where(inside, 1.0, np.nan)[None], labels)
+    if np.abs(found.labels).max() >= 2**31:
+        raise ValueError(f"labels: got {found.labels[np.abs(found.labels).argmax()]}; expected numbers below 2^31")
     present = found.labels[found.nodes > 0].tolist()
     known = {label: f"label {label}" for label in present} | dict(names or {})
     return _base64(np.asarray(labels)[inside], "<i4"), {label: known[label] for label in present}
