@@ -11,10 +11,10 @@ from jaxtyping import Array, Float
 
 from hks_jax.checks import require_count, require_number, require_real
 from hks_jax.compilation import numpy_where_known
-from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.eigenpairs import Eigenpairs, require_pairs
 from hks_jax.signatures.filters import Custom, Derivative, Heat, Wave
 from hks_jax.signatures.spectral_functions import source_indices, spectral_columns, spectral_diagonal, spectral_trace
-from hks_jax.signatures.times import default_energies, positive_range, require_pairs
+from hks_jax.signatures.times import default_energies, positive_range
 from hks_jax.signatures.truncation import resolved_times
 from hks_jax.traced import is_traced
 

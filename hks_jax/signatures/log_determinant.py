@@ -12,9 +12,9 @@ from jaxtyping import Array, Float
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import require_number
-from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.eigenpairs import Eigenpairs, require_pairs
 from hks_jax.linear.divided_differences import gauss
-from hks_jax.signatures.times import dimension_of, positive_range, require_pairs, volume_of
+from hks_jax.signatures.times import dimension_of, positive_range, volume_of
 from hks_jax.signatures.truncation import truncation
 from hks_jax.traced import is_traced
 
