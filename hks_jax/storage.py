@@ -179,11 +179,12 @@ def load_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
 
 def write_npz(path: str | os.PathLike[str], content: Mapping[str, Any], compressed: bool = True) -> None:
     """Write arrays by name to an npz archive atomically."""
-    if objects := [name for name, array in content.items() if np.asarray(array).dtype.hasobject]:
+    arrays: dict[str, Any] = {name: np.asarray(array) for name, array in content.items()}
+    if objects := [name for name, array in arrays.items() if array.dtype.hasobject]:
         raise ValueError(f"{', '.join(objects)}: got Python objects for an npz; expected arrays of numbers or texts")
     save = np.savez_compressed if compressed else np.savez
     with atomic_path(path) as temporary, open(temporary, "wb") as stream:
-        save(stream, **content)
+        save(stream, **arrays)
 
 
 def _check_number(file: Path, archive: zipfile.ZipFile) -> None:

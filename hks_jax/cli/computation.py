@@ -15,7 +15,7 @@ from hks_jax.cli.parsing import Times, parse_times
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_checks import Interpolation, MetricChoice
-from hks_jax.eigen.automatic import choose_solver
+from hks_jax.eigen.automatic import choose_solvers
 from hks_jax.fem.boundary import BoundarySpec, default_boundary, unreached_sides
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result
@@ -134,7 +134,7 @@ def solve(pencil: hj.Pencil | hj.MirrorPencil, settings: Settings, progress: Pro
     unknowns, dimension = sum(part.space.n_dof for part in pencil.parts), pencil.space.dimension
     assert dimension is not None
     k = default_k(dimension, unknowns) if settings.k is None else settings.k
-    name = choose_solver(settings.solver, pencil.parts[0], -(-k // len(pencil.parts))).name
+    name = choose_solvers(settings.solver, pencil, k)[0].name
     with progress.stage("eigenpairs", f"{k} of {unknowns} by {name}"):
         pairs = hj.eigenpairs(pencil, k, solver=settings.solver, progress=progress.update)
         jax.block_until_ready(pairs.eigenvalues)

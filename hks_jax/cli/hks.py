@@ -96,8 +96,9 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         refuse(args, ("through",), "this option is for a volume; leave it out for a slice")
     noise = None
     if not saved:
-        use_dtype(args.dtype)
-        noise = noise_of_volume(args, volume, volume.grid(args.components), progress)  # may fail, so it comes first
+        if args.noise is not None:  # the noise is read first, because reading it may fail
+            use_dtype(args.dtype)
+            noise = noise_of_volume(args, volume, volume.grid(args.components), progress)
         solved = compute_pairs(volume, settings, progress)
     if args.save_pairs:  # the eigenpairs are written first, because later steps may fail
         with progress.stage("writing", str(args.output / PAIRS)):

@@ -176,7 +176,7 @@ def _lines(description: dict[str, Any]) -> list[str]:
             lines.append(f"                {as_options(description['question'])}")
         elif bad > MANY * description["inside"]:
             lines.append(
-                "                noise does not explain so many; for naturally indefinite tensors, see --positive"
+                "                noise does not explain this; for naturally indefinite tensors, see --positive"
             )
         elif bad:
             lines[-1] += ": see --repair"

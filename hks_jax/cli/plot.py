@@ -118,6 +118,7 @@ def _panels(result: Result, args: argparse.Namespace) -> Any:
         titles=titles if result.times.size else [args.array or args.result.stem],
         unit=args.unit or "",
         shared_range=args.range == "shared",
+        cmap=args.cmap,
         centre=1.0 if around_one else None,
         vmin=vmin,
         vmax=vmax,
@@ -125,7 +126,6 @@ def _panels(result: Result, args: argparse.Namespace) -> Any:
         least_range=LEAST_RANGE,
         suptitle=title,
         orientation=placed(volume, box, args.view),
-        **({"cmap": args.cmap} if args.cmap else {}),
     )
 
 

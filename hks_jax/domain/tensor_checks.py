@@ -65,7 +65,7 @@ def require_spd(
         of_grids = f"{_MASK}, or raise their eigenvalues (hks_jax.io.repair_tensors)"
         if bad.sum() > MANY * inside.sum():
             of_grids = (
-                "Noise rarely makes so many tensors indefinite. If they are indefinite by nature, as stress is, make a "
+                "Noise rarely makes this many tensors indefinite. If the tensors describe stress or strain, make a "
                 f"metric by hks_jax.TensorField.from_indefinite. {_MASK}, if they are outside the domain"
             )
         refuse(name, bad, inside, place, what, of_grids if place == "node" else "Raise their eigenvalues")

@@ -51,6 +51,12 @@ def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensol
     return SOLVERS[solver]()
 
 
+def choose_solvers(solver: str | Eigensolver, pencil: AnyPencil, k: int) -> list[Eigensolver]:
+    """Return the solver of each problem; the problems of a doubled domain share the k eigenpairs."""
+    share = -(-k // len(pencil.parts))
+    return [choose_solver(solver, part, share) for part in pencil.parts]
+
+
 def choose_for_fit(pencil: AnyPencil, k: int) -> Eigensolver:
     """Return the solver that ``"auto"`` chooses in a fit.
 

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.eigen.automatic import choose_solver
+from hks_jax.eigen.automatic import choose_solver, choose_solvers
 from hks_jax.eigen.derivative import of_simple
 from hks_jax.eigen.doubled import merge, solve_doubled
 from hks_jax.eigen.eigenpairs import RESULTS, SPARE, Eigenpairs, MultipletChoice, truncate
@@ -171,8 +171,7 @@ def _lowest(
 ) -> Eigenpairs:
     total = sum(part.size for part in pencil.parts)
     size = min(k + SPARE, total) if multiplet == "complete" else k
-    share = -(-size // len(pencil.parts))  # the problems of a doubled domain share the eigenpairs
-    solvers = [choose_solver(solver, part, share) for part in pencil.parts]
+    solvers = choose_solvers(solver, pencil, size)
     extra = min(1, total - size)  # the next eigenvalue shows whether k cuts a multiple eigenvalue
     if isinstance(pencil, MirrorPencil):
         pairs = solve_doubled(pencil, solvers, size, extra, throw, report)

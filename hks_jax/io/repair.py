@@ -166,10 +166,10 @@ def _why_so_many(volume: TensorVolume, finite: Float[np.ndarray, "n d d"], floor
     if floor is not None and not question:
         return "Choose a lower floor, or leave out voxels at the boundary of the mask"
     if question or not len(finite):
-        return question or "Noise does not explain so many invalid tensors. Programs often write NaN outside a mask"
+        return question or "Noise does not explain all invalid tensors. Programs often write NaN outside a mask"
     largest = np.abs(np.linalg.eigvalsh(finite.astype(np.float64))).max()
     return (
-        "Noise does not explain so many invalid tensors. Tensors S that are naturally indefinite, such as stress, need "
+        "Noise does not explain all invalid tensors. Tensors S of stress or strain are naturally indefinite, and need "
         f"a map to positive definite tensors: exp(S/s) with a scale s (|eigenvalue| ≤ {largest:.3g} for the invalid "
         f"tensors), or S + c·I with a shift c > {-least_eigenvalue(finite):.3g}. Use positive_tensors or --positive"
     )

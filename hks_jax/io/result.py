@@ -228,6 +228,12 @@ class Result:
         return getattr(self.place, "length_unit", "")
 
 
+def require_result(result: Any) -> None:
+    """Raise TypeError for anything that is not a result."""
+    if not isinstance(result, Result):
+        raise TypeError(f"result: got {type(result).__name__}; expected hks_jax.io.Result, as Result.read returns it")
+
+
 def signature_file(result: Path) -> Path:
     """Return the path of the signature in a folder of ``hks-jax hks`` or of a study's subject, or else the path."""
     if not result.is_dir():

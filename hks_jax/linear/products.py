@@ -53,7 +53,7 @@ def batched_with_columns(matrices: Float[Array, "m i j"], columns: Float[Array, 
     if accelerators.at_hand() or len(matrices) < _MANY or matrices.shape[2] > _TERMS:
         return matmul(matrices, columns)
     # XLA might fuse the computation of ``columns`` into the sum, and repeat this computation for each row of a matrix.
-    # A `cond`, both branches of which give the same result, prevents the fusion.
+    # A `cond` with equal results of both branches prevents the fusion.
     return jax.lax.cond(jnp.isfinite(columns[0, 0, 0]), _written_out, matmul, matrices, columns)
 
 

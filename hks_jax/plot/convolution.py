@@ -11,7 +11,7 @@ from scipy.special import ndtr
 
 from hks_jax.domain.components import active_elements
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.plot.figure import frame, require_plane, side_in_inches
+from hks_jax.plot.figure import frame, plane_of, side_in_inches
 from hks_jax.plot.images import scalar_image
 from hks_jax.plot.tracing import LEAST_COSINE, DirectionField, Which
 
@@ -121,7 +121,7 @@ def line_integral_convolution(
         >>> image.get_array().shape
         (64, 64, 4)
     """
-    require_plane("field", field)
+    plane_of(field)
     if not 0 < contrast <= 1:
         raise ValueError(f"contrast: got {contrast}; expected a number in (0, 1]")
     grid = field.grid

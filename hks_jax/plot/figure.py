@@ -69,11 +69,15 @@ def finished(fig: Figure, suptitle: str, path: str | os.PathLike[str] | None = N
     return fig
 
 
-def require_plane(name: str, domain: Any) -> None:
-    """Raise an error unless the argument `name` is a grid in two dimensions or, if it is "field", a field on one."""
-    if name == "field":
-        require_field(domain)
-    grid = domain.grid if name == "field" else domain
+def plane_of(field: Any) -> Grid:
+    """Return the grid of a tensor field; raise an error unless the argument is a field in two dimensions."""
+    require_field(field)
+    require_plane("field", field.grid)
+    return field.grid
+
+
+def require_plane(name: str, grid: Any) -> None:
+    """Raise an error unless the argument `name` is a grid in two dimensions."""
     require_grid(grid)
     if grid.dimension != 2:
         raise ValueError(

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from hks_jax.domain.degenerate import degenerate_points as find_degenerate_points
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.plot.figure import cell_extent, colour_bar, frame, legend_below, require_plane, side_in_inches
+from hks_jax.plot.figure import cell_extent, colour_bar, frame, legend_below, plane_of, require_plane, side_in_inches
 
 FILL = 0.92
 """The size of the largest ellipse or cross relative to its cell; at most 1, because larger glyphs overlap."""
@@ -58,8 +58,7 @@ def ellipses(
         >>> len(marks.get_offsets())  # one at each node
         81
     """
-    require_plane("field", field)
-    grid = field.grid
+    grid = plane_of(field)
     if kind not in ("metric", "tensor"):
         raise ValueError(f'kind: got {kind!r}; expected "metric" or "tensor"')
     if sizes not in ("common", "fit"):

@@ -199,11 +199,11 @@ def panel_colours(
     The values of the first and the last colour of each image are its `limits`. Without `limits`, the colour range
     follows from the values of the image or, if `shared` is True, from the values of all images.
     """
-    rules = {name: kwargs.pop(name) for name in RULES if name in kwargs}
+    rules, cmap = {name: kwargs.pop(name) for name in RULES if name in kwargs}, kwargs.pop("cmap", None)
     if limits is not None:
         if np.shape(limits) != (len(images), 2):
             raise ValueError(f"limits: got shape {np.shape(limits)}; expected {(len(images), 2)}, a pair per time")
-        return [{**kwargs, "vmin": low, "vmax": high} for low, high in limits]
+        return [{**kwargs, "cmap": cmap, "vmin": low, "vmax": high} for low, high in limits]
     values = [image.compressed() for image in images]
     colours = colours_of([np.concatenate(values)], **rules) * len(values) if shared else colours_of(values, **rules)
-    return [{"cmap": own.cmap, **kwargs, "vmin": own.low, "vmax": own.high} for own in colours]
+    return [{**kwargs, "cmap": cmap or own.cmap, "vmin": own.low, "vmax": own.high} for own in colours]

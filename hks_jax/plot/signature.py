@@ -12,7 +12,7 @@ from scipy import ndimage
 from hks_jax import Grid
 from hks_jax.fem.boundary import normalise_boundary
 from hks_jax.io import TensorVolume
-from hks_jax.io.result import Result
+from hks_jax.io.result import Result, require_result
 from hks_jax.plot.images import Colours, colours_of
 from hks_jax.plot.orientation import Orientation, View
 from hks_jax.plot.panels import hks_panels, panel_titles
@@ -59,8 +59,7 @@ def signature_panels(
         >>> len(hj.plot.signature_panels(result).axes)
         2
     """
-    if not isinstance(result, Result):
-        raise TypeError(f"result: got {type(result).__name__}; expected hks_jax.io.Result, as Result.read returns it")
+    require_result(result)
     volume, inside = result.volume, np.isfinite(result.values[0])
     grid, box = cropped(volume, inside)
     colours = _colours(result, inside)

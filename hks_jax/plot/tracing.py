@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from hks_jax.checks import real_array
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.plot.figure import frame, require_plane, side_in_inches
+from hks_jax.plot.figure import frame, plane_of, side_in_inches
 
 Which = Literal["major", "minor"]
 
@@ -32,7 +32,7 @@ class DirectionField:
     """
 
     def __init__(self, field: TensorField, which: Which) -> None:
-        require_plane("field", field)
+        plane_of(field)
         if which not in ("major", "minor"):
             raise ValueError(f'which: got {which!r}; expected "major" or "minor"')
         grid = field.grid
@@ -88,7 +88,7 @@ def trace(
         >>> print(np.ptp(np.hypot(*(line + 0.3).T)) < 0.01)  # an arc of a circle about (−0.3, −0.3)
         True
     """
-    require_plane("field", field)
+    plane_of(field)
     points = np.asarray(real_array("seeds", seeds), dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2:
         raise ValueError(f"seeds: got shape {points.shape}; expected (n, 2)")
@@ -119,7 +119,7 @@ def evenly_spaced_lines(
         >>> print(max(np.ptp(np.hypot(*(line + 0.3).T)) for line in lines) < 0.01)  # arcs of circles
         True
     """
-    require_plane("field", field)
+    plane_of(field)
     if not 0 < separation < math.inf:
         raise ValueError(f"separation: got {separation}; expected a positive length, in the unit of the coordinates")
     h, n_steps = _lengths(field, None, None)
@@ -254,7 +254,7 @@ def integral_lines(
         >>> len(lines.get_segments())
         2
     """
-    require_plane("field", field)
+    plane_of(field)
     if seeds is None:
         if not density > 0:
             raise ValueError(f"density: got {density}; expected a positive number")

@@ -5,7 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.arrays import nan_is_meant, nan_outside
@@ -136,7 +136,25 @@ def _nan_if_lost(
     scale: Float[Array, " m"],
 ) -> Float[Array, "m *shape"]:
     """Return the signature, with NaN at times at which errors may exceed a few per cent of the largest value."""
-    known, parts, times, scale = jax.lax.stop_gradient((values, pencil.parts, times, scale))
+    lost = _lost(settings, *jax.lax.stop_gradient((values, pencil.parts, times, scale)))
+    if not is_traced(lost) and lost.any():
+        warn_of_accuracy(
+            f"times: the signatures at {int(lost.sum())} of {times.size} times, the first {float(times[lost][0]):.4g}, "
+            f"are NaN, because errors in {times.dtype} may exceed a few per cent. Relative errors grow with t, in "
+            "particular if the lowest eigenvalue is far above zero or above a potential's least value. Use eigenpairs "
+            "or smaller times"
+        )
+    return values * jnp.where(lost, jnp.nan, 1).astype(values.dtype).reshape(-1, *[1] * (values.ndim - 1))
+
+
+@partial(jax.jit, static_argnums=0)
+def _lost(
+    settings: Colouring | None,
+    known: Float[Array, "m *shape"],
+    parts: tuple[Pencil, ...],
+    times: Float[Array, " m"],
+    scale: Float[Array, " m"],
+) -> Bool[Array, " m"]:
     if settings is None:
         eps, least = float(jnp.finfo(times.dtype).eps), jnp.stack([jnp.min(part.mass.diagonal()) for part in parts])
         error = max(_ROUNDING, eps) / jnp.min(least)
@@ -147,15 +165,7 @@ def _nan_if_lost(
     most = jnp.max(jnp.where(jnp.isnan(known), 0, jnp.abs(known)).reshape(times.size, -1), axis=1)
     # Constants, where they are functions of the space, keep the signature far above the error at any time.
     decays = not any(part.n_null for part in parts)
-    lost = late | decays & ~(error * scale <= 0.01 * most)
-    if not is_traced(lost) and lost.any():
-        warn_of_accuracy(
-            f"times: the signatures at {int(lost.sum())} of {times.size} times, the first {float(times[lost][0]):.4g}, "
-            f"are NaN, because errors in {times.dtype} may exceed a few per cent. Relative errors grow with t, in "
-            "particular if the lowest eigenvalue is far above zero or above a potential's least value. Use eigenpairs "
-            "or smaller times"
-        )
-    return values * jnp.where(lost, jnp.nan, 1).astype(values.dtype).reshape(-1, *[1] * (values.ndim - 1))
+    return late | decays & ~(error * scale <= 0.01 * most)
 
 
 def _read_as_unknowns(pencil: AnyPencil) -> AnyPencil:

@@ -93,7 +93,7 @@ def definite_product(
 
 
 def first_beyond(values: Values) -> Scalar:
-    """Estimate the lowest eigenvalue Λ beyond the computed eigenvalues, of which the largest must be positive."""
+    """Estimate Λ, the lowest eigenvalue above the computed ones; the largest computed eigenvalue must be positive."""
     return values[-1] * (1 + 1 / values.size)
 
 

@@ -200,7 +200,7 @@ class InteriorAdjoint(FactorisedAdjoint):
         def product(x: Columns) -> tuple[Columns, Float[Array, " b"]]:
             return factor.solve(stiffness(x) - shifts * mass(x)), complement.SINGULAR * inner(x, x)
 
-        # Rounding leaves components along computed eigenvectors φⱼ, of which A amplifies only those with λⱼ near σ.
+        # Rounding leaves components along computed eigenvectors φⱼ. A amplifies such a component only if λⱼ is near σ.
         right = factor.solve(b)
         return conjugate_gradients(product, without_near, right, wanted, inner, without_known).converged
 

@@ -88,7 +88,7 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
         return max((n_dof - 16 * self.block) // 4, 0)
 
     def plan(self, k: int, nulls: int = 0) -> Plan:
-        """Return the slice size and other static settings for k eigenvalues, of which the first ``nulls`` are zero."""
+        """Return the slice size and other static settings for k eigenvalues; the first ``nulls`` are zero."""
         slices = max(round(k / (self.slice_size or SLICE)), 1)
         size = math.ceil(1.06 * k / slices) + 2
         return Plan(k, self.block, size, 3 * slices + 12, self.tolerance, nulls)

@@ -18,7 +18,7 @@ from hks_jax import __version__
 from hks_jax.checks import require_real
 from hks_jax.domain.simplicial_mesh import SurfaceMesh, TetMesh
 from hks_jax.io import TensorVolume
-from hks_jax.io.result import Result
+from hks_jax.io.result import Result, require_result
 from hks_jax.plot.orientation import LETTERS
 from hks_jax.plot.panels import checked_times
 from hks_jax.plot.signature import METRICS, bounding_box
@@ -82,8 +82,7 @@ def explore(
         >>> page.read_text(encoding="utf-8")[:15]
         '<!doctype html>'
     """
-    if not isinstance(result, Result):
-        raise TypeError(f"result: got {type(result).__name__}; expected hks_jax.io.Result, as Result.read returns it")
+    require_result(result)
     mesh, noise = result.place, result.arrays.get("deviation")
     if isinstance(mesh, TetMesh):
         raise ValueError(f"{result.source}: got a result on tetrahedra; expected a grid or a surface. Use ParaView")
