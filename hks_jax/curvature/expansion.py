@@ -25,7 +25,7 @@ from hks_jax.curvature.jet import (
     wraps_per_axis,
 )
 from hks_jax.domain import spd
-from hks_jax.domain.tensor_field import TensorField, require_field
+from hks_jax.domain.tensor_field import TensorField, require_field, require_laplace_beltrami
 
 Coefficients: TypeAlias = list[Array]
 Pair: TypeAlias = tuple[taylor.Series, taylor.Series]
@@ -67,7 +67,7 @@ def hks_expansion(
         periodic: whether the axes are periodic; one value for all axes, or one per axis.
 
     Raises:
-        ValueError: times that are not a vector of positive numbers; an order that is not implemented; fewer than 8
+        ValueError: Fick's operator; times that are not a vector of positive numbers; an order that is not implemented; fewer than 8
             nodes along an axis of a nodal field; a bad `periodic`.
 
     Examples:
@@ -76,6 +76,7 @@ def hks_expansion(
         1.033
     """
     require_field(field)
+    require_laplace_beltrami(field, "the expansion in curvature")
     dimension = field.grid.dimension
     highest = HIGHEST_ORDER[dimension]
     order = highest if order is None else order

@@ -13,19 +13,34 @@ from hks_jax.domain.grid import Grid
 from hks_jax.traced import is_traced
 
 MetricChoice = Literal["tensor", "inverse", "adjugate"]
+OperatorChoice = Literal["laplace-beltrami", "fick"]
 Interpolation = Literal["linear", "log-euclidean"]
 
 MANY = 0.05
 """The largest fraction of the tensors that noise at the rim of a mask plausibly makes invalid."""
 
 
-def check_metric_choice(metric: str | None) -> None:
-    """Raise ValueError unless ``metric`` names one of the metrics that diffusion tensors can define."""
+def of_diffusion(metric: str | None, operator: str | None) -> tuple[MetricChoice, OperatorChoice]:
+    """Return the metric and the operator of diffusion tensors D; raise ValueError unless exactly one is chosen."""
+    choices = (
+        'metric="inverse" (g = D⁻¹, in which points are near if diffusion is fast), "tensor" (g = D, as in the paper) '
+        'or "adjugate" (g = |D| D⁻¹) for the Laplace–Beltrami operator, or operator="fick" for Fick\'s law'
+    )
+    if metric is None and operator == "fick":
+        return "inverse", "fick"
+    if operator is not None:
+        got = f"{operator!r}" if metric is None else f"{operator!r} and metric={metric!r}"
+        raise ValueError(f"operator: got {got}; expected one choice: {choices}")
     if metric not in ("tensor", "inverse", "adjugate"):
-        raise ValueError(
-            f'metric: got {metric!r}; expected "inverse" (g = D⁻¹, the distances of diffusion), '
-            '"tensor" (g = D, as in the paper) or "adjugate" (g = |D| D⁻¹). There is no default: choose one'
-        )
+        raise ValueError(f"metric: got {metric!r}; expected {choices}. There is no default: choose one")
+    return metric, "laplace-beltrami"
+
+
+def checked_operator(operator: Any) -> OperatorChoice:
+    """Return the name of an operator; raise ValueError for an unknown name."""
+    if operator not in ("laplace-beltrami", "fick"):
+        raise ValueError(f'operator: got {operator!r}; expected "laplace-beltrami" or "fick"')
+    return operator
 
 
 def checked_interpolation(interpolation: Any) -> Interpolation:

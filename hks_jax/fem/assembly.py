@@ -111,6 +111,7 @@ def assemble(
             if is_given:
                 raise ValueError(f'quadrature: got "cancelling" with {what}; expected "gauss"')
         operator = operator._replace(cancelling=True)
+    operator = operator._replace(fick=getattr(domain, "operator", None) == "fick")
     nodes = None
     if isinstance(domain, SimplicialMesh):
         if boundary not in MESH_BOUNDARIES:

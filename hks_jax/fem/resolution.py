@@ -21,6 +21,7 @@ class SampledMetric(eqx.Module):
     tensors: Float[Array, "*shape d d"]  # the metric at grid nodes, or on mesh cells in the basis of the cell's edges
     spacing: Float[np.ndarray | Array, " d"] | None  # the spacing of the grid; None on a mesh
     interpolation: Interpolation = eqx.field(static=True, default="linear")
+    fick: bool = eqx.field(static=True, default=False)  # whether the operator is Fick's, with D = T⁻¹
 
 
 class Resolution(eqx.Module):
@@ -37,7 +38,7 @@ def resolution_of(metric: SampledMetric, space: FunctionSpace, lumped: bool, can
     """Return the resolution of the functions of a space, from the spacing of a grid or the edges of a mesh."""
     if isinstance(space, GridSpace):
         domain = mask_for(metric.tensors, space.domain)
-        settings = space.periodic, metric.interpolation, lumped, cancelling
+        settings = space.periodic, metric.interpolation, lumped, cancelling, metric.fick
         return Resolution(*_of_grid(metric.tensors, domain, metric.spacing, *settings), order=1 + cancelling)
     assert isinstance(space, MeshSpace)
     return _of_mesh(metric.tensors, space.triangulation.cells, space.triangulation.n_vertices, lumped)
@@ -81,10 +82,12 @@ def _dispersion(xp: Any, tensors: Any, spacing: Any, lumped: bool, cancelling: b
 # vector of axis a. An element lacks the energy of the corrector w, Aₐₐ(∂ₐ²w)² hₐ²/12. For gradients p with the
 # covariance A⁻¹, the missing energy is δAeₐ·A⁻¹δAeₐ/12Aₐₐ, relative to the energy of p along one axis. The estimate
 # holds for √t above the length on which the metric varies; for smaller t only its order of magnitude is right.
-def _turning(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...]) -> Any:
+# Fick's operator has the flux matrix A = D = T⁻¹.
+def _turning(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...], fick: bool) -> Any:
     """Return the relative error (*shape) of eigenvalues due to the variation of tensors between neighbours."""
-    root = xp.sqrt(spd.determinant(tensors))[..., None, None]
-    flux, reciprocal = spd.adjugate(tensors) / root, tensors / root
+    determinant = spd.determinant(tensors)[..., None, None]
+    root = determinant if fick else xp.sqrt(determinant)
+    flux, reciprocal = spd.adjugate(tensors) / root, tensors * (root / determinant)
     total = xp.zeros(tensors.shape[:-2], tensors.dtype)
     for a, wraps in enumerate(periodic):
         jump = xp.roll(flux[..., a], -1, a) - flux[..., a]
@@ -126,7 +129,7 @@ def _neighbours(xp: Any, domain: Any, axis: int, wraps: bool) -> Any:
     return pairs & (xp.arange(n) < n - 1).reshape([-1 if a == axis else 1 for a in range(domain.ndim)])
 
 
-@numpy_where_known(static_argnums=(3, 4, 5, 6))
+@numpy_where_known(static_argnums=(3, 4, 5, 6, 7))
 def _of_grid(
     xp: Any,
     tensors: Any,
@@ -136,15 +139,18 @@ def _of_grid(
     interpolation: Interpolation,
     lumped: bool,
     cancelling: bool,
+    fick: bool,
 ) -> tuple[Any, ...]:
     tensors = xp.where(domain[..., None, None], tensors, xp.eye(tensors.shape[-1], dtype=tensors.dtype))
     along = [spacing[a] ** 2 * tensors[..., a, a] for a in range(tensors.shape[-1])]
-    return (
-        xp.sqrt(xp.max(xp.stack(along), axis=0)),
-        _dispersion(xp, tensors, spacing, lumped, cancelling),
-        _turning(xp, tensors, domain, periodic),
-        _swelling(xp, tensors, domain, periodic, interpolation),
-    )
+    turning = _turning(xp, tensors, domain, periodic, fick)
+    swelling = _swelling(xp, spd.inverse(tensors) if fick else tensors, domain, periodic, interpolation)
+    if fick:
+        # Fick's volume element is exact. An error of √|D| is one of the eigenvalues to the power d/2, and so of the
+        # signature, proportional to λ^(d/2) at small times.
+        turning, swelling = turning + swelling, xp.zeros_like(swelling)
+    dispersion = _dispersion(xp, tensors, spacing, lumped, cancelling)
+    return xp.sqrt(xp.max(xp.stack(along), axis=0)), dispersion, turning, swelling
 
 
 _BIAS = (0.03, 0.22)

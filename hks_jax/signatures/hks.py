@@ -22,7 +22,7 @@ from hks_jax.fem.assembly import assemble
 from hks_jax.fem.boundary import BoundarySpec, normalise_boundary
 from hks_jax.signatures.filters import Heat
 from hks_jax.signatures.spectral_functions import spectral_diagonal, spectral_trace
-from hks_jax.signatures.times import dimension_of, times_of, volume_of
+from hks_jax.signatures.times import dimension_of, measure_of, times_of
 from hks_jax.signatures.truncation import resolved_times, truncation
 from hks_jax.spectrum_free.heat_diagonal import hks_spectrum_free
 from hks_jax.spectrum_free.plan import Unattainable, choose_method, least_work, work
@@ -45,7 +45,6 @@ class AutomaticHKS(eqx.Module):
         tail: (n_times,) the estimated share of the signature that the eigenpairs lack, which decides the method.
         method: the spectrum-free method, ``"colouring"`` or ``"selected-inversion"``; ``"none"`` if it was not used.
         overlap_time: the shortest time from eigenpairs, at which both methods were compared; NaN if they were not.
-        overlap_difference: the greatest difference of the methods at `overlap_time`, relative to (4πt)^(−d/2), or NaN.
         overlap_difference: the greatest difference between the two methods at `overlap_time`, relative to
             (4πt)^(−d/2); NaN without comparison.
     """
@@ -85,14 +84,15 @@ def hks(
     """Compute the heat kernel signature HKS(t, x) = k_t(x, x) = Σᵢ exp(−λᵢt) φᵢ(x)².
 
     See Sun, Ovsjanikov and Guibas 2009, eq. 5, and Zobel, Reininghaus and Hotz, section 2. The unit of ``"raw"`` is
-    1/(metric length)^d. The signature is NaN outside the mask, and 0 at Dirichlet nodes.
+    1/(metric length)^d, and 1/length^d for Fick's operator. The signature is NaN outside the mask, and 0 at Dirichlet nodes.
 
     Args:
         times: (n_times,) positive, in (metric length)².
         normalisation: ``"raw"`` is the signature itself. ``"heat-trace"`` divides it by the heat trace Σᵢ exp(−λᵢt)
-            (Sun et al.). ``"volume"`` multiplies it by the domain's area or volume, so that it tends to 1 for large t,
-            except with a potential or a density. ``"flat"`` multiplies it by (4πt)^(d/2), so that it tends to 1 for
-            small t away from the boundary, or to 1/ρ with a density ρ.
+            (Sun et al.). ``"volume"`` multiplies it by the domain's area or volume, of the metric or of Fick's volume
+            element dx, so that it tends to 1 for large t, except with a potential. ``"flat"`` multiplies it by
+            (4πt)^(d/2), or by (4πt)^(d/2) √|D| for Fick's operator, so that it tends to 1 for small t away from the
+            boundary, or to 1/ρ with a density ρ. At vertices of a mesh, √|D| is the mean over the cells around them.
         method: ``"spectral"`` sums over the pairs. ``"spectrum-free"`` uses only the matrices of the pairs (see
             `hks_spectrum_free`). ``"auto"`` sums over the pairs at times at which the sum is accurate to the tolerance,
             and uses the matrices at the other times; `hks_auto` also reports its choice.
@@ -113,8 +113,8 @@ def hks(
     """
     if method == "spectral":
         times = resolved_times(pairs, times)
-        scale = None if normalisation == "raw" else normaliser(pairs, times, normalisation)
-        return spectral_diagonal(pairs, Heat(times), scale)
+        scale = None if normalisation == "raw" else _of_times(pairs, times, normalisation)
+        return _of_nodes(pairs, normalisation, spectral_diagonal(pairs, Heat(times), scale))
     if method == "auto":
         return hks_auto(pairs, times, normalisation, tolerance).values
     if method != "spectrum-free":
@@ -199,7 +199,7 @@ def _scaled(pairs: Eigenpairs, times: Float[Array, " m"], normalisation: str, va
         raise ValueError(
             'normalisation: got "heat-trace", which needs eigenvalues; use "raw", "volume", "flat" or method="spectral"'
         )
-    return values * normaliser(pairs, times, normalisation).reshape(-1, *[1] * (values.ndim - 1))
+    return values * normaliser(pairs, times, normalisation)
 
 
 def _difference(pairs: Eigenpairs, times: Float[Array, " 1"], tolerance: float, most: float) -> Float[Array, ""]:
@@ -215,17 +215,28 @@ def _difference(pairs: Eigenpairs, times: Float[Array, " 1"], tolerance: float, 
         warnings.simplefilter("ignore", AccuracyWarning)
         spectral = hks(pairs, times)
         other = hks_spectrum_free(pencil, times, method=settings or "selected-inversion", tolerance=tolerance)
-    return jnp.nanmax(jnp.abs(spectral - other)) * (4 * math.pi * times[0]) ** (pairs.space.dimension / 2)
+    return jnp.nanmax(jnp.abs(spectral - other) * normaliser(pairs, times, "flat"))
 
 
-def normaliser(pairs: Eigenpairs, times: Float[Array, " n"], normalisation: str) -> Float[Array, " n"]:
-    """Return the factor at each time by which `hks` multiplies the raw signature."""
+def normaliser(pairs: Eigenpairs, times: Float[Array, " n"], normalisation: str) -> Float[Array, "n *broadcast"]:
+    """Return the factor at each time, and at each node or for all nodes, by which `hks` multiplies the signature."""
+    factors = _of_times(pairs, times, normalisation)
+    return _of_nodes(pairs, normalisation, factors.reshape(-1, *[1] * len(pairs.space.node_shape)))
+
+
+def _of_nodes(pairs: Eigenpairs, normalisation: str, values: Float[Array, "n *shape"]) -> Float[Array, "n *shape"]:
+    """Return the values, times √|D| with the normalisation "flat" of Fick's operator."""
+    density = pairs.pencil.density if normalisation == "flat" else None
+    return values if density is None else values * density
+
+
+def _of_times(pairs: Eigenpairs, times: Float[Array, " n"], normalisation: str) -> Float[Array, " n"]:
     if normalisation == "raw":
         return jnp.ones_like(times)
     if normalisation == "heat-trace":
         return 1 / spectral_trace(pairs, Heat(times))
     if normalisation == "volume":
-        return jnp.broadcast_to(volume_of(pairs, 'normalisation="volume"'), times.shape)
+        return jnp.broadcast_to(measure_of(pairs, 'normalisation="volume"'), times.shape)
     if normalisation == "flat":
         return (4 * math.pi * times) ** (dimension_of(pairs, 'normalisation="flat"') / 2)
     raise ValueError(f'normalisation: got {normalisation!r}; expected "raw", "heat-trace", "volume" or "flat"')

@@ -29,8 +29,13 @@ def dimension_of(pairs: Eigenpairs, purpose: str) -> int:
 
 
 def volume_of(pairs: Eigenpairs, purpose: str) -> Float[Array, ""]:
-    """Return the area or volume of the domain; raise ValueError if it is not known."""
+    """Return the area or volume of the domain in its metric; raise ValueError if it is not known."""
     return _stated(pairs.pencil.volume, "volume", "domain", purpose)
+
+
+def measure_of(pairs: Eigenpairs, purpose: str) -> Float[Array, ""]:
+    """Return the integral of 1 with the mass; raise ValueError if it is not known."""
+    return _stated(pairs.pencil.measure, "volume", "domain", purpose)
 
 
 def _stated(value: Any, name: str, of: str, purpose: str) -> Any:
