@@ -14,7 +14,7 @@ from hks_jax.cli.options import SOLVING, as_options, defaults
 from hks_jax.cli.parsing import Times, parse_times
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
-from hks_jax.domain.tensor_checks import Interpolation, MetricChoice
+from hks_jax.domain.tensor_checks import Interpolation, MetricChoice, OperatorChoice
 from hks_jax.eigen.automatic import choose_solvers
 from hks_jax.fem.boundary import BoundarySpec, default_boundary, unreached_sides
 from hks_jax.io import TensorVolume
@@ -32,10 +32,12 @@ class ComputationError(RuntimeError):
 class Settings:
     """The settings of a computation, with the names of the options.
 
-    The metric is None only for meshes. For the boundary, None means `default_boundary` for volumes, neumann for meshes.
+    The metric is None for Fick's operator, and for a mesh with the Euclidean metric. For the boundary, None means
+    `default_boundary` for volumes, neumann for meshes.
     """
 
     metric: MetricChoice | None
+    operator: OperatorChoice
     interpolation: Interpolation
     k: int | None
     boundary: BoundarySpec | None
@@ -50,8 +52,14 @@ class Settings:
     def of(cls, args: argparse.Namespace | None = None, **given: Any) -> "Settings":
         """Return the settings in `args`, or else the default settings; settings in `given` replace some of them."""
         chosen = vars(defaults(f"@metric {SOLVING} @signature")) | (vars(args) if args else {})
-        given = {"metric": chosen["metric"] or "tensor", "times": parse_times(chosen["times"]), **given}
+        metric = chosen["metric"] or (None if chosen["operator"] == "fick" else "tensor")
+        given = {"metric": metric, "times": parse_times(chosen["times"]), **given}
         return cls(**{field.name: chosen[field.name] for field in fields(cls)} | given)
+
+    def field(self, grid: hj.Grid, tensors: Any) -> hj.TensorField:
+        """Return the field of diffusion tensors with the metric or the operator of these settings."""
+        of: Any = {"operator": self.operator, "interpolation": self.interpolation, "name": "tensors"}
+        return hj.TensorField.from_diffusion(grid, tensors, self.metric, **of)
 
 
 class Solved(NamedTuple):
@@ -83,7 +91,9 @@ def result_of(
             _warn_of_late(times, pairs, progress)
         values, origin = _signature(pairs, times, settings)
     report = {"input": described, **_report(settings, pairs, times), **origin}
-    return Result(place, values, np.asarray(times), np.asarray(pairs.eigenvalues), report)
+    density = pairs.pencil.density
+    arrays = {} if density is None else {"density": np.asarray(density)}
+    return Result(place, values, np.asarray(times), np.asarray(pairs.eigenvalues), report, arrays)
 
 
 def _warn_of_late(times: tuple[float, ...], pairs: hj.Eigenpairs, progress: Progress) -> None:
@@ -107,11 +117,9 @@ def automatic_times(pairs: hj.Eigenpairs, n: int) -> tuple[float, ...]:
 
 
 def field_of(volume: TensorVolume, grid: hj.Grid, settings: Settings) -> hj.TensorField:
-    """Return the metric of a volume or slice on its grid, in the chosen precision."""
+    """Return the field of a volume or slice on its grid, in the chosen precision."""
     use_dtype(settings.dtype)
-    metric, lies, tensors = settings.metric, settings.interpolation, volume.tensors.astype(settings.dtype)
-    assert metric is not None
-    return hj.TensorField.from_diffusion(grid, tensors, metric, interpolation=lies, name="tensors")
+    return settings.field(grid, volume.tensors.astype(settings.dtype))
 
 
 def compute_pairs(volume: TensorVolume, settings: Settings, progress: Progress) -> Solved:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from hks_jax.cli.computation import Settings, describe_input, field_of
-from hks_jax.cli.options import READING
+from hks_jax.cli.options import READING, refuse
 from hks_jax.cli.outputs import Done, writing
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read_volume
@@ -41,6 +41,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     from hks_jax.plot.signature import cropped, placed
 
     volume, settings, periodic = read_volume(args, progress), Settings.of(args), args.periodic or ""
+    refuse(args, ("operator",), "the curvature is that of a metric; pass --metric inverse for that of D⁻¹")
     if volume.dimension != 2:
         raise ValueError(
             f"--slice: got tensors on a volume of shape {volume.shape}; expected two dimensions for the Gaussian "

@@ -25,6 +25,8 @@ from hks_jax.cli.computation import ComputationError, use_dtype
 from hks_jax.cli.options import FORMATS, refuse
 from hks_jax.cli.outputs import Done, writing
 from hks_jax.cli.progress import Progress
+from hks_jax.cli.reading import require_one
+from hks_jax.domain.tensor_field import diffusion_tensors
 from hks_jax.fem.boundary import unreached_sides
 from hks_jax.io import read_tensors, save, save_tensors
 from hks_jax.io.formats import format_of
@@ -37,7 +39,11 @@ target TARGET  the signature, an .npz file or the folder of a signature
 --init FILE  the initial tensors: {FORMATS} (default: identity)
 --metric tensor|inverse|adjugate
     the metric of the tensors D in --init: inverse is D⁻¹, tensor is D itself, adjugate is |D|D⁻¹. This option is
-    required except for NumPy's files without a unit of length, whose tensors are the metric by default
+    required except for NumPy's files without a unit of length, whose tensors are the metric by default, and for
+    --operator fick
+--operator laplace-beltrami|fick
+    the operator of the target, as for 'hks-jax hks' (default: the operator in TARGET, otherwise laplace-beltrami). With
+    fick, tensors.npz contains the diffusivity D
 --order ORDER  order of the components in --init, if the file does not declare it
 @interpolation
 --parametrisation log-euclidean|cholesky|conformal|eigenvalues|rotation = log-euclidean
@@ -71,8 +77,6 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
     if args.init is None:
         refuse(args, ("metric", "order"), "this option describes the tensors in --init, which is missing; pass both")
-    elif args.metric is None and format_of(args.init).image:
-        raise ValueError(_NO_METRIC)
     from hks_jax import fit_metric
     from hks_jax.inverse import H1, Data, Search, TotalVariation
     from hks_jax.inverse.metric_fit import RESULTS
@@ -85,6 +89,8 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
                 f"TARGET: got {target.source} with the normalisation {target.normalisation}; expected raw. Compute "
                 "it by 'hks-jax hks' without --normalisation"
             )
+        args.operator = args.operator or target.settings.get("operator", "laplace-beltrami")
+        require_one(args)
         # The mask is the domain of the computed signature, so all of its components belong to the domain.
         grid = target.grid
         init = _initial(args, target.volume, grid, progress)
@@ -114,7 +120,19 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         raise ComputationError(f"the fit failed: {RESULTS['not finite']}. Check --init and -k")
     if not fit.converged:
         progress.warn(f"the fit ended early, {fit.result}: {RESULTS[fit.result]}; writing the best metric found")
-    names = ("init", "metric", "interpolation", "h1", "tv", "dtype", "checkpoint", "noise", "boundary", *_OF_SEARCH)
+    names = (
+        "init",
+        "metric",
+        "operator",
+        "interpolation",
+        "h1",
+        "tv",
+        "dtype",
+        "checkpoint",
+        "noise",
+        "boundary",
+        *_OF_SEARCH,
+    )
     report = {
         "target": {
             "source": target.source,
@@ -136,9 +154,13 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
 def _initial(args: argparse.Namespace, target: TensorVolume, grid: Grid, progress: Progress) -> TensorField:
     if args.init is None:
         unit = np.eye(grid.dimension, dtype=args.dtype)
-        return TensorField(grid, np.broadcast_to(unit, (*grid.shape, *unit.shape)), args.interpolation)
+        tensors = np.broadcast_to(unit, (*grid.shape, *unit.shape))
+        return TensorField(grid, tensors, args.interpolation, operator=args.operator)
+    fick = args.operator == "fick"
+    if args.metric is None and not fick and format_of(args.init).image:
+        raise ValueError(_NO_METRIC)
     volume = read_tensors(args.init, args.order)
-    if args.metric is None and volume.length_unit:  # of NumPy's files, as in `require_metric`
+    if args.metric is None and not fick and volume.length_unit:  # of NumPy's files, as in `require_metric`
         raise ValueError(_NO_METRIC)
     if volume.shape != grid.shape:
         remedy = "Give one tensor for each node of the target"
@@ -155,16 +177,17 @@ def _initial(args: argparse.Namespace, target: TensorVolume, grid: Grid, progres
             f"--init: got no tensors at {lacking} of the target's {int(grid.inside.sum())} nodes; expected tensors at "
             "all nodes of the target. Restrict the target to the mask of --init"
         )
-    metric: Any = args.metric or "tensor"
-    tensors = volume.tensors.astype(args.dtype)
-    return TensorField.from_diffusion(grid, tensors, metric, interpolation=args.interpolation, name="--init")
+    metric: Any = args.metric or (None if fick else "tensor")
+    of: Any = {"operator": args.operator, "interpolation": args.interpolation, "name": "--init"}
+    return TensorField.from_diffusion(grid, volume.tensors.astype(args.dtype), metric, **of)
 
 
 def _write(args: argparse.Namespace, fit: Any, target: Result, report: dict[str, Any], progress: Progress) -> Done:
     from hks_jax.plot import fit_panels, save_figure
     from hks_jax.plot.signature import placed
 
-    volume = replace(target.volume, tensors=np.asarray(fit.field.domain_tensors), order="matrix", frame="voxel")
+    tensors = diffusion_tensors(fit.field) if args.operator == "fick" else fit.field.domain_tensors
+    volume = replace(target.volume, tensors=np.asarray(tensors), order="matrix", frame="voxel")
     volume = replace(volume, source=target.source, digest=digest(target.source), notes=(), unit="")
     history = {"losses": "loss", "misfits": "misfit", "stages": "stage", "starts": "start"}
     columns = {name: np.array([getattr(step, of) for step in fit.history]) for name, of in history.items()}

@@ -38,7 +38,7 @@ from hks_jax.cli.noise import Noisy, check_noise, noise_of_volume, signature_of,
 from hks_jax.cli.options import READING, SOLVING, options_in, refuse
 from hks_jax.cli.outputs import PAIRS, Done, of_earlier, write_outputs
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import read, read_volume, require_metric
+from hks_jax.cli.reading import read, read_volume, require_metric, require_one
 from hks_jax.fem.assembly import MESH_BOUNDARIES
 from hks_jax.io import read_mask, read_mesh, read_mesh_arrays, sample_tensors
 from hks_jax.io.formats import format_of
@@ -65,7 +65,7 @@ OPTIONS = f"""
 --save-pairs  write the eigenpairs to OUT/pairs.npz; 'hks-jax hks OUT/pairs.npz --times …' reuses them
 """
 
-_OF_TENSORS = ("metric", "order", "interpolation")
+_OF_TENSORS = ("metric", "operator", "order", "interpolation")
 """Options that refer to tensors at the vertices of a mesh."""
 _NO_NOISE = "this option needs tensors; saved eigenpairs and meshes with the Euclidean metric have none. Leave it out"
 
@@ -148,8 +148,12 @@ def _check_mesh_options(args: argparse.Namespace) -> None:
         why = "this option needs tensors, but without --array and --tensors a mesh has the Euclidean metric"
         refuse(args, _OF_TENSORS, f"{why}. Pass --array or --tensors, or leave this option out")
         refuse(args, ("noise",), _NO_NOISE)
-    elif args.metric is None:
-        raise ValueError("--metric: the tensors at the vertices need a metric. Choose inverse, tensor or adjugate")
+    elif args.metric is None and args.operator != "fick":
+        raise ValueError(
+            "--metric: the tensors at the vertices need a metric. Choose inverse, tensor or adjugate, or pass "
+            "--operator fick"
+        )
+    require_one(args)
 
 
 def _read_domain(args: argparse.Namespace, progress: Progress) -> tuple[SurfaceMesh | TetMesh, Noisy | None]:
@@ -170,7 +174,7 @@ def _read_domain(args: argparse.Namespace, progress: Progress) -> tuple[SurfaceM
     settings: Any = {"at": "vertices", "interpolation": args.interpolation, "mask": inside}
 
     def domain(tensors: Any) -> SurfaceMesh | TetMesh:
-        return kind.from_tensors(vertices, cells, tensors, args.metric, **settings)
+        return kind.from_tensors(vertices, cells, tensors, args.metric, operator=args.operator, **settings)
 
     if args.tensors:
         volume = read(argparse.Namespace(**vars(args) | {"file": args.tensors, "others": []}), progress)

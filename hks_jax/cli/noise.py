@@ -70,11 +70,8 @@ def signature_of(args: argparse.Namespace, solved: Solved, noise: hj.TensorNoise
     if noise is None:
         return of_pairs(settings, progress)
 
-    def metric(D: Any) -> Any:
-        assert settings.metric is not None
-        return hj.TensorField.from_diffusion(field.grid, D, settings.metric, interpolation=settings.interpolation)
-
-    return with_error_bars(args, of_pairs, Noisy(volume.tensors, noise, metric), pairs, settings, progress)
+    noisy = Noisy(volume.tensors, noise, partial(settings.field, field.grid))
+    return with_error_bars(args, of_pairs, noisy, pairs, settings, progress)
 
 
 def with_error_bars(

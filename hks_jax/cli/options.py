@@ -29,10 +29,14 @@ file FILE...
 [metric] the metric
 --metric tensor|inverse|adjugate
     the metric that is made of the diffusion tensors D. inverse: D⁻¹, in which two points are near if water diffuses
-    quickly between them, as along a fibre; t is then the time of diffusion, in s for D in mm2/s and voxels in mm. This
-    is the usual choice for diffusion MRI. tensor: D itself, in which points are near if diffusion is slow. adjugate:
-    |D|D⁻¹, which is D⁻¹ times the determinant of D. The option is required except for NumPy's files without a unit of
-    length, whose tensors are the metric by default
+    quickly between them, as along a fibre; t is then a time, in s for D in mm2/s and voxels in mm. This is the usual
+    choice for the geometry of diffusion MRI. tensor: D itself, in which points are near if diffusion is slow. adjugate:
+    |D|D⁻¹, which is D⁻¹ times the determinant of D. Without --operator fick, the option is required except for NumPy's
+    files without a unit of length, whose tensors are the metric by default
+--operator laplace-beltrami|fick = laplace-beltrami
+    laplace-beltrami: the operator of the metric (default), which does not depend on coordinates; for D⁻¹ it differs
+    from the diffusion of a substance where the determinant of D varies. fick: the diffusion of a substance by Fick's
+    law, div(D∇u), whose density becomes uniform in space; it takes no --metric, and t is a time as for inverse
 [voxels] voxels
 --slice AXIS=N  one slice, such as z=14, instead of the volume
 --mask FILE  zeros and ones in NIfTI, MRtrix, NRRD, .npy, or in the array 'mask' of an .npz
@@ -89,8 +93,9 @@ file FILE...
 --solver SOLVER = auto  eigensolver
 [signature] the signature
 --times T...
-    positive numbers, in s for --metric inverse; or auto, or auto:N for N times that suit the eigenvalues, the last when
-    √t is a third of the length of the domain (default auto:6). 'hks-jax info FILE' shows suitable times
+    positive numbers, in s for --metric inverse and --operator fick; or auto, or auto:N for N times that suit the
+    eigenvalues, the last when √t is a third of the length of the domain (default auto:6). 'hks-jax info FILE' shows
+    suitable times
 --normalisation raw|heat-trace|volume|flat = raw  normalisation of the signature
 --method spectral|spectrum-free|auto = spectral
     method: a sum over eigenpairs (default), a computation without eigenpairs, or a choice by t, k and the spacing. For

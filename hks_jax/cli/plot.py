@@ -65,7 +65,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     result = replace(result, values=result.values[chosen], times=result.times[chosen[: result.times.size]])
     if args.scaled and result.normalisation == "raw":
         settings = {**result.settings, "normalisation": "flat"}
-        result = replace(result, values=result.values * result.flat_scale, report={"settings": settings})
+        result = replace(result, values=result.values * result.to_flat, report={"settings": settings})
     save_figure(_panels(result, args) if args.points is None else _curves(result, args), args.output, dpi=args.dpi)
     ends = {"least": float(np.nanmin(result.values)), "greatest": float(np.nanmax(result.values))}
     summary = {"source": str(args.result), "times": result.times.tolist(), "values": ends}

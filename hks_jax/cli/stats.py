@@ -36,10 +36,10 @@ result RESULT  the folder OUT that 'hks-jax hks' wrote, or an .npz from there
 """
 
 _SCALES = {
-    "raw": "the heat kernel signature, per (metric length)^d",
+    "raw": "the heat kernel signature, per (metric length)^d, or per length^d for Fick's operator",
     "heat-trace": "the heat kernel signature divided by the heat trace",
-    "volume": "the heat kernel signature times the domain's volume in the metric",
-    "flat": "(4πt)^(d/2) times the heat kernel signature, which is 1 for flat space",
+    "volume": "the heat kernel signature times the domain's volume in the metric, or in space for Fick's operator",
+    "flat": "(4πt)^(d/2) times the heat kernel signature, times √|D| for Fick's operator, which is 1 for flat space",
 }
 
 
@@ -115,7 +115,10 @@ def _about(result: Result, atlas: Path, names: Path | None) -> dict[str, Any]:
             "image (NIfTI: mm); a slice is one voxel thick"
         },
         "lambda1_t": {"Description": "t times the first positive eigenvalue, equal for all subjects"},
-        "t": {"Description": "time in (metric length)²; in s for the metric D⁻¹ with D in mm²/s", **unit},
+        "t": {
+            "Description": "time in (metric length)²; in s for D in mm²/s with the metric D⁻¹ or Fick's operator",
+            **unit,
+        },
         "mean": {"Description": f"mean over the region's voxels in the domain: {values}"},
         "std": {"Description": "standard deviation over the same voxels (the root of the mean square deviation)"},
         "median": {"Description": "median over the same voxels"},
@@ -123,5 +126,5 @@ def _about(result: Result, atlas: Path, names: Path | None) -> dict[str, Any]:
         "GeneratedBy": {"Name": "hks-jax", "Version": __version__},
         "LabelMap": {"File": atlas.name, "SHA256": digest(atlas)},
         "Names": None if names is None else {"File": names.name, "SHA256": digest(names)},
-        "Settings": {name: settings.get(name) for name in ("metric", "boundary", "normalisation", "k")},
+        "Settings": {name: settings.get(name) for name in ("metric", "operator", "boundary", "normalisation", "k")},
     }

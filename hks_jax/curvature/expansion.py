@@ -67,8 +67,8 @@ def hks_expansion(
         periodic: whether the axes are periodic; one value for all axes, or one per axis.
 
     Raises:
-        ValueError: Fick's operator; times that are not a vector of positive numbers; an order that is not implemented; fewer than 8
-            nodes along an axis of a nodal field; a bad `periodic`.
+        ValueError: Fick's operator; times that are not a vector of positive numbers; an order that is not implemented;
+            fewer than 8 nodes along an axis of a nodal field; a bad `periodic`.
 
     Examples:
         >>> expansion = hj.hks_expansion(hj.examples.sphere_field(9), [0.1], order=1)[0, 4, 4]

@@ -161,7 +161,8 @@ def laplace_beltrami(
         periodic: as in `gaussian_curvature`.
 
     Raises:
-        ValueError: Fick's operator; values of another shape; fewer than 8 nodes along an axis of nodal values; a bad `periodic`.
+        ValueError: Fick's operator; values of another shape; fewer than 8 nodes along an axis of nodal values; a bad
+            `periodic`.
 
     Examples:
         >>> print(hj.laplace_beltrami(field, lambda x: (x + 0.3) @ (x + 0.3))[4, 4].round(3))  # of r²

@@ -64,7 +64,7 @@ class SimplicialMesh(eqx.Module):
         tensors: Any,
         metric: MetricChoice | None = None,
         *,
-        operator: Literal["fick"] | None = None,
+        operator: OperatorChoice = "laplace-beltrami",
         at: Literal["faces", "cells", "vertices"] | None = None,
         interpolation: Interpolation = "linear",
         mask: Any = None,
@@ -74,10 +74,10 @@ class SimplicialMesh(eqx.Module):
         A surface uses only the tangential parts of the tensors.
 
         The tangential part of D is its quadratic form on the plane of a triangle. If D is a diffusion tensor, its
-        tangential part describes diffusion within the surface. Exactly one of ``metric`` and ``operator`` must be given
-        (see `TensorField.from_diffusion`): the metric ``"tensor"``, g = D; ``"inverse"``, g = D⁻¹; ``"adjugate"``, g =
-        |D| D⁻¹; or Fick's operator div(D∇u) with the area or volume of space. On a surface, D in these formulas is the
-        tangential part. If D is the identity, g is the Euclidean metric.
+        tangential part describes diffusion within the surface. The choice has no default (see
+        `TensorField.from_diffusion`): the metric ``"tensor"``, g = D; ``"inverse"``, g = D⁻¹; or ``"adjugate"``, g =
+        |D| D⁻¹; or no metric and ``operator="fick"``, which is div(D∇u) with the area or volume of space. On a surface,
+        D in these formulas is the tangential part. If D is the identity, g is the Euclidean metric.
 
         Tensors at vertices are interpolated to the centre of each cell: by the mean of the tensors at its vertices, or
         with ``"log-euclidean"`` by the exponential of the mean of their logarithms. Using one tensor per cell causes an
@@ -89,19 +89,20 @@ class SimplicialMesh(eqx.Module):
             tensors: one symmetric tensor per cell, (F, 3, 3) or (C, 3, 3), or per vertex, (V, 3, 3). The tensors must
                 be positive definite; on a surface, only their tangential parts must be.
             metric: ``"inverse"``, ``"tensor"`` or ``"adjugate"``.
-            operator: ``"fick"``.
+            operator: ``"laplace-beltrami"`` of the metric, or ``"fick"``.
             at: whether the tensors belong to ``"faces"`` (of a surface), ``"cells"`` (of a solid) or ``"vertices"``;
                 needed only if there are as many cells as vertices.
             interpolation: ``"linear"`` or ``"log-euclidean"``, for tensors at vertices; see `TensorField`.
             mask: the domain, as for the class; tensors outside are ignored.
 
         Raises:
-            ValueError: an unknown metric, operator or interpolation; wrong shapes; tensors that are NaN, infinite, unsymmetric or
-                not positive definite (with their number and the first place); the errors that the class raises.
+            ValueError: an unknown metric, operator or interpolation; wrong shapes; tensors that are NaN, infinite,
+                unsymmetric or not positive definite (with their number and the first place); the errors that the class
+                raises.
         """
         mesh = cls(vertices, cells, mask=mask)
-        metric, chosen = of_diffusion(metric, operator)
-        object.__setattr__(mesh, "operator", chosen)
+        metric = of_diffusion(metric, operator)
+        object.__setattr__(mesh, "operator", operator)
         checked_interpolation(interpolation)
         array, edges, triangulation = real_array("tensors", mesh.restrict(tensors)), mesh._edges, mesh.triangulation
         at_vertices = _place(array.shape, triangulation, at) == "vertices"

@@ -20,20 +20,25 @@ MANY = 0.05
 """The largest fraction of the tensors that noise at the rim of a mask plausibly makes invalid."""
 
 
-def of_diffusion(metric: str | None, operator: str | None) -> tuple[MetricChoice, OperatorChoice]:
-    """Return the metric and the operator of diffusion tensors D; raise ValueError unless exactly one is chosen."""
-    choices = (
-        'metric="inverse" (g = D⁻¹, in which points are near if diffusion is fast), "tensor" (g = D, as in the paper) '
-        'or "adjugate" (g = |D| D⁻¹) for the Laplace–Beltrami operator, or operator="fick" for Fick\'s law'
-    )
-    if metric is None and operator == "fick":
-        return "inverse", "fick"
-    if operator is not None:
-        got = f"{operator!r}" if metric is None else f"{operator!r} and metric={metric!r}"
-        raise ValueError(f"operator: got {got}; expected one choice: {choices}")
+def of_diffusion(metric: str | None, operator: str) -> MetricChoice:
+    """Return the metric that is made of diffusion tensors D for an operator; Fick's operator has the metric D⁻¹.
+
+    Raises:
+        ValueError: an unknown name; no metric for the Laplace–Beltrami operator; a metric for Fick's operator.
+    """
+    if checked_operator(operator) == "fick":
+        if metric is not None:
+            raise ValueError(
+                f'metric: got {metric!r} with operator="fick", which determines the metric D⁻¹. Leave one of them out'
+            )
+        return "inverse"
     if metric not in ("tensor", "inverse", "adjugate"):
-        raise ValueError(f"metric: got {metric!r}; expected {choices}. There is no default: choose one")
-    return metric, "laplace-beltrami"
+        raise ValueError(
+            f'metric: got {metric!r}; expected "inverse" (g = D⁻¹, in which points are near if diffusion is fast), '
+            '"tensor" (g = D, as in the paper) or "adjugate" (g = |D| D⁻¹), or no metric with operator="fick" (Fick\'s '
+            "law). There is no default: choose one"
+        )
+    return metric  # type: ignore[return-value]
 
 
 def checked_operator(operator: Any) -> OperatorChoice:

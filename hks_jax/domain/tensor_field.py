@@ -1,7 +1,7 @@
 """A field of symmetric positive definite tensors on a grid: a Riemannian metric."""
 
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -132,14 +132,14 @@ class TensorField(eqx.Module):
         D: Any,
         metric: MetricChoice | None = None,
         *,
-        operator: Literal["fick"] | None = None,
+        operator: OperatorChoice = "laplace-beltrami",
         interpolation: Interpolation = "linear",
         name: str = "D",
     ) -> "TensorField":
         """Return the metric of a field of diffusion tensors D (*shape, d, d), or the field of Fick's operator.
 
-        Choose exactly one of the two; there is no default, because several conventions are in use. ``metric`` gives the
-        Laplace–Beltrami operator of a metric g, which does not depend on coordinates:
+        Pass either ``metric`` or ``operator="fick"``; there is no default, because several conventions are in use. The
+        metric g gives its Laplace–Beltrami operator, which does not depend on coordinates:
 
         - ``"inverse"``: g = D⁻¹, in which two points are near if diffusion between them is fast. The operator is
           √|D| div(|D|^(−½) D∇u) = div(D∇u) − ½ (D∇log|D|)·∇u, which is Fick's only where |D| is constant. Heat becomes
@@ -160,15 +160,16 @@ class TensorField(eqx.Module):
             >>> print(jnp.linalg.det(metric.tensors[4, 4]).round(3))  # 1/|D|
             0.25
             >>> diffusion = hj.TensorField.from_diffusion(field.grid, field.tensors, operator="fick")
-            >>> print(hj.assemble(diffusion).measure.round(3), hj.assemble(diffusion).volume.round(3))  # ∫dx, ∫|D|^(−½)dx
+            >>> pencil = hj.assemble(diffusion)
+            >>> print(pencil.measure.round(3), pencil.volume.round(3))  # the integrals of dx and of |D|^(−½) dx
             1.0 0.5
         """
         tensors = spd.symmetrise(_checked_tensors(name, grid, D))
-        metric, operator = of_diffusion(metric, operator)
+        metric = of_diffusion(metric, operator)
         if metric == "tensor":
             return cls._checked(grid, interpolation, tensors)
-        metric_tensors = _metric_of_diffusion(spd.identity_outside(tensors, grid.inside), metric)
-        return cls(grid, metric_tensors, interpolation, operator=operator)
+        given = _metric_of_diffusion(spd.identity_outside(tensors, grid.inside), metric)
+        return cls(grid, given, interpolation, operator=operator)
 
     @classmethod
     def from_deformation(

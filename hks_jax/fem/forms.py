@@ -88,8 +88,8 @@ def integrate(form: Form, volume: Float[Array, " q"], functions: ShapeFunction, 
     """Integrate a form over one element, for all n² pairs of n shape functions.
 
     The shape functions have values (q, n, *c) and gradients (q, n, *c, d) at q quadrature points. Each of the q entries
-    of ``volume`` is the weight of a quadrature point times the density of the volume element. A form that does not return one number, or that is not
-    linear in u, raises ValueError.
+    of ``volume`` is the weight of a quadrature point times the density of the volume element. A form that does not
+    return one number, or that is not linear in u, raises ValueError.
     """
     read = _reads(form, *(jax.tree.map(lambda leaf: leaf[0], each) for each in (functions, points)))
 

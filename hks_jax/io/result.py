@@ -36,7 +36,8 @@ class Result:
         eigenvalues: (k,), or (0,) if they are unknown.
         report: facts about the computation; the entry ``settings`` contains its settings.
         arrays: more named arrays, saved with the result: ``deviation``, ``bias`` and ``noise_maps`` (n_draws, n_times,
-            *shape) for error bars, ``scaled_times`` (t times the first positive eigenvalue), and ``input_tensors``.
+            *shape) for error bars, ``scaled_times`` (t times the first positive eigenvalue), ``density`` (√|D| of the
+            diffusivity D, for Fick's operator), and ``input_tensors``.
         name: ``"hks"`` or ``"curvature"``.
         source: the file from which the result was read.
 
@@ -124,9 +125,8 @@ class Result:
             # Only a mesh with a mask may have vertices that belong to no cell, which are outside the domain.
             place = kind(arrays["vertices"], cells, mask=np.ones(cells.shape[:1], bool))
         eigenvalues, report = arrays.get("eigenvalues", np.zeros(0)), {"settings": record.get("settings") or {}}
-        more = {
-            n: a for n, a in arrays.items() if n in ("deviation", "bias", "noise_maps", "scaled_times", "input_tensors")
-        }
+        known = ("deviation", "bias", "noise_maps", "scaled_times", "density", "input_tensors")
+        more = {n: a for n, a in arrays.items() if n in known}
         return cls(place, values, times, eigenvalues, report, more, name, str(path))
 
     def save(self, stem: Path, image: str, origin: Mapping[str, Any] | None = None) -> None:
@@ -188,8 +188,8 @@ class Result:
 
     @property
     def lengths(self) -> Float[np.ndarray, " n_times"] | None:
-        """(n_times,) the distances √(Dt), where D is the median mean diffusivity; None if the metric is not D⁻¹."""
-        if self.tensors is None or self.settings.get("metric") != "inverse":
+        """(n_times,) the distances √(Dt), where D is the median mean diffusivity; None if t is no time of diffusion."""
+        if self.tensors is None or not self.in_time:
             return None
         diffusivity = median_mean_diffusivity(self.volume.with_mask(np.isfinite(self.values[0])))
         return np.sqrt(diffusivity * self.times) if diffusivity else None
@@ -200,7 +200,7 @@ class Result:
         if "deviation" not in self.arrays:
             return None
         # Normalisations except "raw" and "flat" have no known value in flat space, so the median at each time is used.
-        flat = {"raw": 1 / self.flat_scale, "flat": 1.0}
+        flat = {"raw": 1 / self.to_flat, "flat": 1.0}
         median = np.nanmedian(self.values, axis=tuple(range(1, self.values.ndim)), keepdims=True)
         return (self.values - flat.get(self.normalisation, median)) / self.arrays["deviation"]
 
@@ -216,11 +216,21 @@ class Result:
         return (4 * np.pi * self.times.reshape(-1, *[1] * (self.values.ndim - 1))) ** (self.dimension / 2)
 
     @property
+    def to_flat(self) -> Float[np.ndarray, "n_times ..."]:
+        """The factor of the normalisation ``"flat"``, which is `flat_scale`, times √|D| for Fick's operator."""
+        return self.flat_scale * self.arrays.get("density", 1.0)
+
+    @property
+    def in_time(self) -> bool:
+        """Whether t is a time, as for the metric D⁻¹ and for Fick's operator."""
+        return self.settings.get("metric") == "inverse" or self.settings.get("operator") == "fick"
+
+    @property
     def unit(self) -> str:
-        """The unit of t: seconds for the metric D⁻¹ of tensors in mm²/s and lengths in mm; empty if it is not known."""
+        """The unit of t: s for D in mm²/s and lengths in mm, with the metric D⁻¹ or Fick's operator; or empty."""
         place = self.place
         known = isinstance(place, TensorVolume) and place.unit and place.length_unit == "mm"
-        return "s" if known and self.settings.get("metric") == "inverse" else ""
+        return "s" if known and self.in_time else ""
 
     @property
     def length_unit(self) -> str:

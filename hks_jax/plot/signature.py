@@ -23,6 +23,7 @@ SPAN = (0.002, 0.998)
 POWERS = {2: (r"4\pi t", "t^{-1}"), 3: (r"(4\pi t)^{3/2}", "t^{-3/2}")}
 """The factor of the normalisation "flat" and the unit of the signature, by dimension; t is a squared length."""
 METRICS = {"tensor": "D", "inverse": "D⁻¹", "adjugate": "|D|D⁻¹"}
+FICK = "Fick's, div(D∇u)"
 LEAST_RANGE = 0.01
 """The colour range is at least 1 % of the values, so that the contrast of nearly constant values is low."""
 RIM = 5
@@ -89,6 +90,9 @@ def caption(result: Result) -> str:
         "flat": f"${factor}$·HKS, which is 1 for flat space",
     }
     metric = METRICS.get(result.settings.get("metric") or "")
+    if result.settings.get("operator") == "fick":
+        names["flat"] = rf"${factor}\sqrt{{|D|}}\,$HKS, which is 1 for constant D"
+        return f"{names[result.normalisation]}, Fick's operator"
     return names[result.normalisation] + f", metric {metric}" * (metric is not None)
 
 

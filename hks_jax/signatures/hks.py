@@ -84,7 +84,8 @@ def hks(
     """Compute the heat kernel signature HKS(t, x) = k_t(x, x) = Σᵢ exp(−λᵢt) φᵢ(x)².
 
     See Sun, Ovsjanikov and Guibas 2009, eq. 5, and Zobel, Reininghaus and Hotz, section 2. The unit of ``"raw"`` is
-    1/(metric length)^d, and 1/length^d for Fick's operator. The signature is NaN outside the mask, and 0 at Dirichlet nodes.
+    1/(metric length)^d, and 1/length^d for Fick's operator. The signature is NaN outside the mask, and 0 at Dirichlet
+    nodes.
 
     Args:
         times: (n_times,) positive, in (metric length)².

@@ -84,8 +84,8 @@ def heat_coefficients(
     area = volume_of(pairs, "the heat trace")
     if pairs.pencil.parts[0].weighted_volume is not None:
         raise ValueError(
-            "pairs: got an operator whose volume element is not that of its metric (Fick's, or with a density); expected "
-            "a Laplace–Beltrami operator, whose a₂ is known. Pass your own coefficients to `log_determinant`"
+            "pairs: got an operator whose volume element is not that of its metric (Fick's, or with a density); "
+            "expected a Laplace–Beltrami operator, whose a₂ is known. Pass your own coefficients to `log_determinant`"
         )
     length = jnp.asarray(boundary_length, area.dtype) * (1 if condition == "neumann" else -1)
     constant = euler_characteristic / 6 + float(((math.pi - angles) ** 2 / (24 * math.pi * angles)).sum())

@@ -58,7 +58,8 @@ from hks_jax.signatures.times import LAST
 KEPT = f"""
 @metric {READING} {SOLVING} @signature @noise
 --time-unit scanner|lambda1 = scanner
-    unit of --times: scanner, for the same t for all subjects, in seconds for D⁻¹ with D in mm²/s (default); or lambda1,
+    unit of --times: scanner, for the same t for all subjects, in seconds for D in mm²/s with the metric D⁻¹ or Fick's
+    operator (default); or lambda1,
     for the same product λ₁t, so that the given numbers are divided by each subject's first positive eigenvalue λ₁.
     Automatic times are log-spaced over the range that suits all subjects, and the study keeps them
 """
@@ -159,7 +160,8 @@ def _options(record: Mapping[str, Any]) -> dict[str, Any]:
     if not record:
         return {}
     times = record["times"] if record["chosen"] == "explicit" else record["chosen"]
-    options = {"times": times, "time_unit": record["time-unit"], **record["settings"], **record["reading"]}
+    options = {"times": times, "time_unit": record["time-unit"], "operator": "laplace-beltrami"}
+    options |= {**record["settings"], **record["reading"]}
     return {name.replace("-", "_"): tuples(value) for name, value in options.items()}
 
 
@@ -221,7 +223,8 @@ Range = tuple[float, float]
 
 def suitable_range(volume: TensorVolume, args: argparse.Namespace) -> Range:
     """Estimate the range of times that suits a subject from its metric and its size, without eigenpairs."""
-    of: dict[str, Any] = describe(args.file, volume, args.boundary)["suits"][args.metric or "tensor"]
+    metric = "inverse" if args.operator == "fick" else args.metric or "tensor"
+    of: dict[str, Any] = describe(args.file, volume, args.boundary)["suits"][metric]
     by_pairs = of["least_time_of_k"] * (1.0 if args.k is None else of["k"] / args.k) ** (2 / volume.dimension)
     return max(of["least_time"], by_pairs), of["largest_time"]
 

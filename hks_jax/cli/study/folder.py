@@ -37,7 +37,7 @@ SUMMARY = {
     "status": "done, failed, or pending if the run did not include the subject",
     "voxels": "number of voxels in the domain",
     "k": "number of eigenpairs",
-    "lambda1": "first positive eigenvalue in 1/(metric length)²; in 1/s for the metric D⁻¹ with D in mm²/s",
+    "lambda1": "first positive eigenvalue in 1/(metric length)²; in 1/s for D in mm²/s with D⁻¹ or Fick's operator",
     "truncation": "largest share of the signature, over t, from omitted eigenpairs (estimate)",
     "resolution": "largest relative error, over t, due to the size of the voxels (estimate)",
     "warnings": "number of warnings, which the subject's sidecar contains",
@@ -204,7 +204,7 @@ def times_text(unit: str) -> str:
     """Return a description of the times of a study."""
     if unit == "lambda1":
         return "the times of each subject are the given numbers divided by its first positive eigenvalue λ₁"
-    return "all subjects have the same times, in (metric length)²; in s for the metric D⁻¹ with D in mm²/s"
+    return "all subjects have the same times, in (metric length)²; in s for D in mm²/s with D⁻¹ or Fick's operator"
 
 
 def _without_folder(about: Mapping[str, Any]) -> dict[str, Any]:

@@ -42,7 +42,11 @@ function setUp() {
   element("title").textContent = about.title;
   element("facts").textContent = about.facts.map(([name, value]) => `${name}: ${value}`).join(" · ");
   element("software").textContent = about.software;
-  element("reading").textContent = isFlat
+  element("reading").textContent = isFlat && about.fick
+    ? `${power}·HKS of Fick's operator div(D∇u) is 1 where D is constant and no boundary is near. At small t it is above 1 ` +
+      "where less can flow away than with the local D, and below 1 where more can. Neumann (natural) boundaries raise it nearby. " +
+      "At large t heat is uniform in space; HKS / mean then shows the differences."
+    : isFlat
     ? `${power}·HKS is 1 where space is flat and no boundary is near. At small t it is above 1 where the curvature is positive, ` +
       "below 1 where it is negative. Neumann (natural) boundaries raise it nearby, up to twofold along a straight side. " +
       "Dirichlet boundaries lower it to 0. The mean of both has nearly no boundary effect. At large t it grows everywhere, because heat has filled the domain; " +

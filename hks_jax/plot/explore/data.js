@@ -60,14 +60,15 @@ const mean = times.map((_, t) => {
 
 // A quantity is the stored signature times a factor at each time.
 const ones = times.map(() => 1);
-const power = dimension === 2 ? "4πt" : "(4πt)³⁄²";
+const power = (dimension === 2 ? "4πt" : "(4πt)³⁄²") + (about.fick ? "√|D|" : "");
 const relative = { name: "HKS / mean", long: "HKS divided by its mean at each t", factor: mean.map((m) => 1 / m), centre: 1 };
 const isFlat = about.normalisation === "raw" || about.normalisation === "flat";
 const quantities = isFlat
   ? [
-      { name: `${power}·HKS`, long: `${power}·HKS, 1 where flat`, factor: ones, centre: 1 },
+      { name: `${power}·HKS`, long: `${power}·HKS, 1 where ${about.fick ? "D is constant" : "flat"}`, factor: ones, centre: 1 },
       relative,
-      { name: "HKS", long: "HKS", factor: about.flat.map((f) => 1 / f), centre: null, log: true },
+      // With Fick's operator the factor √|D| differs between nodes.
+      ...(about.fick ? [] : [{ name: "HKS", long: "HKS", factor: about.flat.map((f) => 1 / f), centre: null, log: true }]),
     ]
   : [
       { name: `HKS, ${about.normalisation}`, long: `HKS, normalised by ${about.normalisation}`, factor: ones, centre: null },

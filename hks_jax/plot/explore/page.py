@@ -21,7 +21,7 @@ from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result, require_result
 from hks_jax.plot.orientation import LETTERS
 from hks_jax.plot.panels import checked_times
-from hks_jax.plot.signature import METRICS, bounding_box
+from hks_jax.plot.signature import FICK, METRICS, bounding_box
 from hks_jax.plot.volumes import middle_node
 from hks_jax.signatures.regions import region_statistics
 from hks_jax.storage import atomic_path
@@ -116,7 +116,7 @@ def explore(
             f"{LIMIT // 1024**2} MiB, which a browser can open. Show fewer times, one slice, or part of the domain"
         )
     # (4πt)^(d/2)·HKS is of order 1 in any unit, so float32 does not underflow.
-    scale = result.flat_scale if result.normalisation == "raw" else 1.0
+    scale = result.to_flat if result.normalisation == "raw" else 1.0
     shown = {"values": (scale * result.values)[:, inside]}
     if noise is not None:
         shown["deviation"] = (scale * noise)[:, inside]
@@ -143,6 +143,7 @@ def explore(
         "times": t.tolist(),
         "lengths": None if result.lengths is None else result.lengths.tolist(),
         "flat": result.flat_scale.ravel().tolist(),
+        "fick": result.settings.get("operator") == "fick",
         "normalisation": result.normalisation,
         "noise": noise is not None,
         "start": [0] if surface else middle_node(shown_inside),
@@ -169,6 +170,8 @@ def _facts(result: Result) -> dict[str, Any]:
         facts |= {"vertices": len(place.vertices), "triangles": len(place.triangulation.cells)}
     if metric := settings.get("metric"):
         facts["metric"] = METRICS[metric]
+    if settings.get("operator") == "fick":
+        facts["operator"] = FICK
     if boundary := settings.get("boundary"):
         facts["boundary"] = boundary if isinstance(boundary, str) else json.dumps(boundary)
     if result.eigenvalues.size and settings.get("method", "spectral") == "spectral":
