@@ -23,7 +23,8 @@ from hks_jax.traced import is_traced
 def heat_flow(pairs: Eigenpairs, times: Any, functions: Any) -> Float[Array, "n_times *functions_and_shape"]:
     """Let functions diffuse on the domain: u(t) = Σᵢ exp(−λᵢt) φᵢ ∫φᵢu, the solution of ∂u/∂t = −Δu.
 
-    The diffusion is anisotropic where the metric is. The result is differentiable with respect to functions, times and
+    The diffusion is anisotropic where the metric is. In the metric D⁻¹ the operator −Δ is not div(D∇·) where the
+    determinant |D| varies; for Fick's law, make the field with ``operator="fick"``. The result is differentiable with respect to functions, times and
     tensors. The result is NaN outside the mask, and 0 at Dirichlet nodes.
 
     Args:

@@ -225,7 +225,7 @@ def normaliser(pairs: Eigenpairs, times: Float[Array, " n"], normalisation: str)
     return _of_nodes(pairs, normalisation, factors.reshape(-1, *[1] * len(pairs.space.node_shape)))
 
 
-def _of_nodes(pairs: Eigenpairs, normalisation: str, values: Float[Array, "n *shape"]) -> Float[Array, "n *shape"]:
+def _of_nodes(pairs: Eigenpairs, normalisation: str, values: Float[Array, "n *any"]) -> Float[Array, "n *shape"]:
     """Return the values, times √|D| with the normalisation "flat" of Fick's operator."""
     density = pairs.pencil.density if normalisation == "flat" else None
     return values if density is None else values * density

@@ -111,6 +111,58 @@ def test_npz_end_to_end_equals_the_library(npz, tmp_path, capsys):
         assert read["eigenvalues"].shape == (25,)
 
 
+def test_ficks_operator_on_the_command_line(nifti, tmp_path, capsys):
+    """Signature, saved pairs, pictures, tables, spectrum and fit; a metric beside it and curvature are refused."""
+    out, again, times = tmp_path / "out", tmp_path / "again", ["--times", "1000", "4000"]
+    read = [str(nifti), "--slice", "z=2", "--operator", "fick", "-q"]
+    assert main(["hks", *read, "-o", str(out), "-k", "25", *times, "--save-pairs"]) == 0
+    D = read_tensors(nifti).slice("z", 2).with_mask(disc())
+    field = hj.TensorField.from_diffusion(D.grid(), np.asarray(D.tensors, float), operator="fick")
+    pairs = hj.eigenpairs(field, 25, "mean")
+    result = Result.read(out)
+    np.testing.assert_allclose(result.values, hj.hks(pairs, [1000.0, 4000.0]), rtol=1e-5)
+    np.testing.assert_allclose(
+        result.values * result.to_flat, hj.hks(pairs, [1000.0, 4000.0], "flat"), rtol=1e-5, err_msg="plot --scaled"
+    )
+    assert (result.settings["operator"], result.settings["metric"]) == ("fick", None)
+    assert result.unit == "s"
+    assert result.lengths is not None
+    assert signature.caption(result).endswith("Fick's operator")
+    assert main(["hks", str(out / "pairs.npz"), "-o", str(again), "-q", *times, "--normalisation", "flat"]) == 0
+    np.testing.assert_allclose(Result.read(again).values, hj.hks(pairs, [1000.0, 4000.0], "flat"), rtol=1e-5)
+    assert main(["plot", str(out), "-o", str(tmp_path / "scaled.png"), "--scaled"]) == 0
+    assert main(["explore", str(again)]) == 0
+    assert "Fick's, div(D∇u)" in (again / "explore.html").read_text()
+    assert main(["info", str(out)]) == 0
+    assert "operator        fick" in capsys.readouterr().out
+    assert main(["spectrum", *read, "-o", str(tmp_path / "spectrum"), "-k", "12"]) == 0
+    report = json.loads((tmp_path / "spectrum" / "report.json").read_text())
+    assert report["settings"]["operator"] == "fick"
+    np.testing.assert_allclose(report["eigenvalues"], hj.eigenpairs(field, 12).eigenvalues, rtol=1e-5, atol=1e-9)
+
+    capsys.readouterr()
+    both = ["--metric", "inverse"]
+    for command in ("hks", "spectrum"):
+        code = main([command, *read, "-o", str(tmp_path / "no"), *both])
+        assert one_error(capsys, code, "--metric: got inverse with --operator fick", "Leave out --metric") == 2
+    assert one_error(capsys, main(["curvature", *read, "-o", str(tmp_path / "no")]), "--operator: the curvature") == 2
+
+
+@pytest.mark.slow
+def test_a_fit_has_the_operator_of_its_target(tmp_path):
+    """The diffusivity that a fit writes has the signature of the target."""
+    x, y = np.moveaxis(FIT_GRID.nodes, -1, 0)
+    D = np.exp(0.4 * np.sin(2 * x) * np.cos(3 * y))[..., None, None] * np.eye(2)
+    field = hj.TensorField.from_diffusion(FIT_GRID, D, operator="fick")
+    values = np.asarray(hj.hks(hj.eigenpairs(field, FIT_GRID.size), FIT_TIMES))
+    record = json.dumps({"settings": {"boundary": "neumann", "operator": "fick"}})
+    target = write_target(tmp_path / "hks.npz", values, provenance=record)
+    out = tmp_path / "fitted"
+    assert main(["fit", str(target), "-o", str(out), "--max-steps", "8", "-q", *FIT_ARGUMENTS]) == 0
+    assert json.loads((out / "report.json").read_text())["settings"]["operator"] == "fick"
+    assert np.linalg.norm(read_tensors(out / "tensors.npz").tensors - D) < 0.03 * np.linalg.norm(D)
+
+
 def test_times_that_do_not_suit_the_domain_are_reported(npz, tmp_path):
     out = tmp_path / "out"
     assert main(["hks", str(npz), "-o", str(out), "-q", "-k", "25", "--times", "0.01", "2", "500"]) == 0
@@ -673,7 +725,8 @@ def test_the_help_of_a_command_is_in_groups_and_says_what_is_hard_to_guess(capsy
             assert title in text
         assert "0.7 um2/ms, 700 um2/s (TORTOISE) or 7e-10 m2/s" in text
         assert "three rows or three columns, as dcm2niix writes them (see --bvec-frame)" in text
-        assert ("t is then the time of diffusion, in s for D in mm2/s and voxels in mm" in text) == (command == "hks")
+        assert ("t is then a time, in s for D in mm2/s and voxels in mm" in text) == (command == "hks")
+        assert ("fick: the diffusion of a substance by Fick's law, div(D∇u)" in text) == (command == "hks")
 
 
 def test_a_line_of_the_table_is_an_option():
