@@ -27,7 +27,8 @@ result RESULT  the folder OUT that 'hks-jax hks' wrote, or an .npz from there
 --labels FILE  region numbers on the same voxels or at the vertices, with 0 for unlabelled (NIfTI, MRtrix, NRRD or .npy)
 @names
 --title TEXT  the page's title (default: the name of the tensors' file)
---unit TEXT  the unit of t (default: s for the metric D⁻¹ or Fick's operator, if the tensors' unit is known; otherwise none)
+--unit TEXT
+    the unit of t (default: s for the metric D⁻¹ or Fick's operator if the tensors' unit is known, otherwise none)
 """
 
 

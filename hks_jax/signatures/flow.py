@@ -24,8 +24,8 @@ def heat_flow(pairs: Eigenpairs, times: Any, functions: Any) -> Float[Array, "n_
     """Let functions diffuse on the domain: u(t) = Σᵢ exp(−λᵢt) φᵢ ∫φᵢu, the solution of ∂u/∂t = −Δu.
 
     The diffusion is anisotropic where the metric is. In the metric D⁻¹ the operator −Δ is not div(D∇·) where the
-    determinant |D| varies; for Fick's law, make the field with ``operator="fick"``. The result is differentiable with respect to functions, times and
-    tensors. The result is NaN outside the mask, and 0 at Dirichlet nodes.
+    determinant |D| varies; for Fick's law, make the field with ``operator="fick"``. The result is differentiable with
+    respect to functions, times and tensors. The result is NaN outside the mask, and 0 at Dirichlet nodes.
 
     Args:
         pairs: the result of `eigenpairs`. The boundary conditions of the pairs also hold for u. Values at Dirichlet

@@ -436,8 +436,8 @@ def test_common_times_suit_all_subjects():
 
 
 def test_automatic_times_follow_the_metric_and_remain_those_of_the_study(study, monkeypatch, capsys):
-    def suitable(scale, k, boundary):
-        args = argparse.Namespace(file=Path("t.nii"), metric="inverse", k=k, boundary=boundary)
+    def suitable(scale, k, boundary, metric="inverse", operator="laplace-beltrami"):
+        args = argparse.Namespace(file=Path("t.nii"), metric=metric, operator=operator, k=k, boundary=boundary)
         # So many voxels that k, and not their size, limits t; in an image much larger.
         many = np.zeros((60, 60, 20, 3, 3))
         many[3:30, 4:28, 5:14] = np.tile(tensors(scale), (3, 3, 3, 1, 1))
@@ -445,6 +445,7 @@ def test_automatic_times_follow_the_metric_and_remain_those_of_the_study(study, 
 
     np.testing.assert_allclose(suitable(2.0, 8, "neumann"), suitable(1.0, 8, "neumann") / 2, rtol=1e-12)
     np.testing.assert_allclose(suitable(1.0, 8, "mean"), suitable(1.0, 4, "neumann"), rtol=1e-12)
+    np.testing.assert_array_equal(suitable(1.0, 8, "mean", None, "fick"), suitable(1.0, 8, "mean"))
     side = 54.0  # mm, of the largest axis, along which D is about 1.5e-3 mm²/s
     assert abs(suitable(1.0, 8, "neumann")[1] / ((side / 2) ** 2 / 1.5e-3) - 1) < 0.3
     assert suitable(1.0, 1, "neumann")[0] > suitable(1.0, 8, "neumann")[0]
@@ -461,6 +462,13 @@ def test_automatic_times_follow_the_metric_and_remain_those_of_the_study(study, 
         stream.write("04\tt1.nii.gz\tcontrol\n05\tt4.nii.gz\tcontrol\n")
     save_tensors(study / "t4.nii.gz", volume(0.8))
     assert times() == first
+    fick = [each for each in command(study, "out") if each not in ("--metric", "inverse")]
+    assert main([*fick, "--metric", "inverse", "--operator", "fick"]) == 2
+    assert "--metric: got inverse with --operator fick" in capsys.readouterr().err
+    assert main([*fick, "--times", "auto:2", "--operator", "fick"]) == 2
+    said = capsys.readouterr().err
+    assert "--metric inverse, not unset" in said
+    assert "--operator laplace-beltrami, not fick" in said
     other = ("--interpolation", "log-euclidean")
     assert main(command(study, "out", "--times", "auto:2", *other)) == 2
     assert "has --interpolation linear, not log-euclidean. Leave" in capsys.readouterr().err

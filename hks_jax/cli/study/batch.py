@@ -143,6 +143,10 @@ def _complete(args: argparse.Namespace) -> str:
     """Replace omitted options by options of the study in the folder or by defaults; return a note about them."""
     before = {} if args.replace else read_json(args.output / "study.json")
     kept, taken = _options(before), []
+    if args.operator == "fick":  # a given operator replaces the study's metric, and a given metric its operator
+        kept.pop("metric", None)
+    elif args.metric is not None:
+        kept.pop("operator", None)
     # Comparable subjects need the same boundary condition, with or without a mask.
     usual = {**vars(defaults(KEPT)), "boundary": "mean"}
     for name in DEFAULTS:
@@ -200,7 +204,7 @@ def _suitable(
 ) -> tuple[float, ...]:
     """Read all subjects, and return times that suit them; ignore subjects that cannot be read."""
     if args.metric == "adjugate":
-        raise ValueError("--times: automatic times in a study need the metric inverse or tensor. Choose the times")
+        raise ValueError("--times: automatic times in a study need inverse, tensor or --operator fick. Choose times")
     ranges: dict[str, Range] = {}
     first = ""
     silent = StudyProgress(1, True, io.StringIO())  # warnings are shown when the subject is computed
