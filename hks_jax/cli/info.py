@@ -199,10 +199,11 @@ def _lines(description: dict[str, Any]) -> list[str]:
         worth = s["k_for_least_time"] <= s["unknowns"] / 4
         takes = f"k ≈ {s['k_for_least_time']}" if worth else "too many eigenpairs; see --method auto"
         of = time if name == "inverse" else ""
-        if name == "inverse":
-            lines.append("with --operator fick, as with --metric inverse:")
         lines.append(
             f"metric {name:<8} t ≥ {s['least_time']:.3g}{of} for a discretisation error of 1 % (needs {takes}); "
             f"t ≥ {s['least_time_of_k']:.3g}{of} for k = {s['k']}; t ≤ {s['largest_time']:.3g}{of} by the domain's size"
+            * (name == "inverse")
         )
+        if name == "inverse":
+            lines.append("operator fick   the same t and k as for the metric inverse")
     return lines

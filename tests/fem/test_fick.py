@@ -259,6 +259,21 @@ def test_normalisations_tend_to_one():
     assert weighted.pencil.measure > 1.5 * few.pencil.measure
 
 
+def test_the_first_order_in_time_is_not_the_curvature_alone():
+    """4πt√|D|·HKS = 1 + t (K/3 − ∇²ρ/ρ) + … with ρ = |D|^¼, here for D = exp(f) I on a torus."""
+    n, t = 24, 0.2
+    grid = hj.Grid((n, n), (2 * np.pi / n,) * 2)
+    x, y = np.moveaxis(grid.nodes, -1, 0)
+    a = np.exp(0.3 * np.sin(x) + 0.2 * np.cos(y))
+    laplacian, squared = -0.3 * np.sin(x) - 0.2 * np.cos(y), (0.3 * np.cos(x)) ** 2 + (0.2 * np.sin(y)) ** 2
+    field = fick(grid, a[..., None, None] * np.eye(2), interpolation="log-euclidean")
+    pencil = hj.assemble(field, "periodic", quadrature="cancelling")
+    found = (hj.hks(hj.eigenpairs(pencil, n * n, solver="dense"), [t], "flat")[0] - 1) / t
+    expected = a * laplacian / 2 / 3 - a * (laplacian / 2 + squared / 4)
+    np.testing.assert_allclose(found, expected, atol=0.02)
+    assert np.abs(expected).max() > 0.25
+
+
 def test_weyl_counts_by_the_metric_and_not_by_the_flat_volume():
     grid = hj.Grid((41, 41), (0.05, 0.05))
     field = fick(grid, 0.01 * diffusivities(grid))
