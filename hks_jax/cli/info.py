@@ -202,7 +202,6 @@ def _lines(description: dict[str, Any]) -> list[str]:
         lines.append(
             f"metric {name:<8} t ≥ {s['least_time']:.3g}{of} for a discretisation error of 1 % (needs {takes}); "
             f"t ≥ {s['least_time_of_k']:.3g}{of} for k = {s['k']}; t ≤ {s['largest_time']:.3g}{of} by the domain's size"
-            * (name == "inverse")
         )
         if name == "inverse":
             lines.append("operator fick   the same t and k as for the metric inverse")

@@ -43,9 +43,9 @@ def assemble(
 
     With the metric T and the basis functions hᵢ, K_ij = ∫ √|T| T⁻¹∇hᵢ·∇hⱼ dx and M_ij = ∫ √|T| hᵢhⱼ dx (Zobel,
     Reininghaus and Hotz, section 3). A domain with ``operator="fick"`` has K_ij = ∫ D∇hᵢ·∇hⱼ dx and M_ij = ∫ hᵢhⱼ dx,
-    where dx replaces the volume element √|T| dx everywhere below, and D = T⁻¹ is interpolated. On grids the elements are
-    Q1 with 2^d Gauss points, and T or its logarithm is interpolated multilinearly (see `TensorField`). On meshes the
-    elements are P1 or P2, and T is constant on each cell.
+    where dx replaces the volume element √|T| dx everywhere below, and D = T⁻¹ is interpolated. On grids the elements
+    are Q1 with 2^d Gauss points, and T or its logarithm is interpolated multilinearly (see `TensorField`). On meshes
+    the elements are P1 or P2, and T is constant on each cell.
 
     A *field* is a number, an array over the nodes, an array over the elements, or a function of position that JAX can
     trace. An array over the nodes, (*shape) or (V,), is interpolated. An array over the elements has n − 1 entries

@@ -160,8 +160,8 @@ def test_constant_diffusivity_has_one_operator():
         )
         np.testing.assert_allclose(other.eigenvalues, one.eigenvalues, rtol=1e-10, atol=1e-11)
         np.testing.assert_allclose(hj.hks(other, [0.01]) * 5**0.5, hj.hks(one, [0.01]), rtol=1e-9)
-        for scale in ("flat", "volume", "heat-trace"):
-            expected = hj.hks(one, [0.01], scale) / (5**0.5 if scale == "heat-trace" else 1)
+        for scale in ("flat", "volume"):
+            expected = hj.hks(one, [0.01], scale)
             np.testing.assert_allclose(hj.hks(other, [0.01], scale), expected, rtol=1e-9)
 
 
@@ -189,8 +189,8 @@ def ring(shape):
     ("shape", "boundary", "interpolation", "masked"),
     [
         ((7, 8), "neumann", "linear", False),
-        ((8, 8), "mean", "linear", True),
-        ((7, 8), ("periodic", "dirichlet"), "log-euclidean", False),
+        pytest.param((8, 8), "mean", "linear", True, marks=pytest.mark.slow),
+        pytest.param((7, 8), ("periodic", "dirichlet"), "log-euclidean", False, marks=pytest.mark.slow),
         pytest.param((4, 5, 4), "neumann", "linear", False, marks=pytest.mark.slow),
     ],
 )
@@ -215,7 +215,10 @@ def test_derivatives_with_respect_to_the_diffusivity(rng, shape, boundary, inter
     np.testing.assert_allclose(tangent, exact, rtol=2e-7)
 
 
-@pytest.mark.parametrize("solver", ["block-lanczos", "shift-invert", "chebyshev-filter"])
+@pytest.mark.parametrize(
+    "solver",
+    ["shift-invert", *(pytest.param(each, marks=pytest.mark.slow) for each in ("block-lanczos", "chebyshev-filter"))],
+)
 def test_every_solver_finds_the_same_pairs(solver):
     shape = (31, 30) if solver == "chebyshev-filter" else (15, 14)
     grid = hj.Grid(shape, (0.1, 0.1), mask=ring(shape))
@@ -226,6 +229,7 @@ def test_every_solver_finds_the_same_pairs(solver):
     np.testing.assert_allclose(hj.hks(pairs, [0.05], "flat"), hj.hks(exact, [0.05], "flat"), rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", [1.0, 1e-9])
 def test_signature_without_eigenpairs(unit):
     """In any unit of D: tolerances are relative to (4πt)^(−d/2)/√|D|."""
@@ -247,11 +251,11 @@ def test_signature_without_eigenpairs(unit):
 
 def test_normalisations_tend_to_one():
     """ "flat" at small times away from the boundary, "volume" at large times; a density has its own volume, too."""
-    grid = hj.Grid((41, 41), (0.05, 0.05))
+    grid = hj.Grid((21, 21), (0.1, 0.1))
     field = fick(grid, diffusivities(grid, 2.0, 0.8))
-    pairs = hj.eigenpairs(field, 500)
-    inner = hj.hks(pairs, [0.008], "flat")[0, 12:-12, 12:-12]
-    assert np.abs(inner - 1).max() < 0.05
+    pairs = hj.eigenpairs(field, 441, solver="dense")
+    inner = hj.hks(pairs, [0.03], "flat")[0, 6:-6, 6:-6]
+    assert np.abs(inner - 1).max() < 0.1
     few = hj.eigenpairs(field, 4)
     np.testing.assert_allclose(hj.hks(few, [100.0], "volume"), 1, rtol=1e-9)
     weighted = hj.eigenpairs(hj.assemble(field, density=1 + grid.nodes[..., 0]), 4)
@@ -275,17 +279,19 @@ def test_the_first_order_in_time_is_not_the_curvature_alone():
 
 
 def test_weyl_counts_by_the_metric_and_not_by_the_flat_volume():
-    grid = hj.Grid((41, 41), (0.05, 0.05))
+    grid = hj.Grid((25, 25), (0.08, 0.08))
     field = fick(grid, 0.01 * diffusivities(grid))
     pencil = hj.assemble(field)
-    number = hj.count_eigenvalues(pencil, 4.0)
-    np.testing.assert_allclose(hj.weyl_count(pencil, [4.0], field), number, rtol=0.1)
+    pairs = hj.eigenpairs(pencil, 300, solver="dense")
+    number = np.sum(np.asarray(pairs.eigenvalues) < 3.0)
+    np.testing.assert_allclose(hj.weyl_count(pencil, [3.0], field), number, rtol=0.1)
     assert pencil.measure < 0.05 * pencil.volume
-    estimate = hj.truncation(hj.eigenpairs(pencil, 60), [0.5, 2.0])
-    trace = hj.heat_trace(hj.eigenpairs(pencil, 400), [0.5, 2.0]), hj.heat_trace(hj.eigenpairs(pencil, 60), [0.5, 2.0])
-    np.testing.assert_allclose(estimate.tail, 1 - trace[1] / trace[0], rtol=0.2)
+    few, times = hj.eigenpairs(pencil, 60, solver="dense"), [0.5, 2.0]
+    missing = 1 - hj.heat_trace(few, times) / hj.heat_trace(pairs, times)
+    np.testing.assert_allclose(hj.truncation(few, times).tail, missing, rtol=0.25, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_resolution_estimate_follows_the_measured_error():
     """The median error of the signature on coarse grids is 1/3 to 3 times the estimate, for Fick's operator, too."""
     fine = hj.Grid((65, 65), (2 / 64,) * 2)
@@ -299,10 +305,18 @@ def test_resolution_estimate_follows_the_measured_error():
         assert np.all((ratio > 1 / 3) & (ratio < 3)), ratio
 
 
+def test_copies_of_a_field_keep_the_operator():
+    grid = hj.Grid((5, 6), (0.1, 0.1))
+    field = fick(grid, diffusivities(grid))
+    wide = hj.reflect(field, 2)
+    assert wide.operator == field.with_tensors(field.tensors).operator == jax.tree.map(jnp.array, field).operator
+    np.testing.assert_allclose(hj.assemble(wide).measure, 0.8 * 0.9, rtol=1e-12)
+
+
+@pytest.mark.slow
 def test_functions_of_fields_and_pairs_know_the_operator():
     grid = hj.Grid((11, 12), (0.1, 0.1))
     field = fick(grid, diffusivities(grid))
-    assert hj.reflect(field, 2).operator == field.with_tensors(field.tensors).operator == "fick"
     np.testing.assert_allclose(
         hj.boundary_influence(field, [0.05], 20)[0],
         hj.boundary_influence(hj.eigenpairs(field, 40, "mean"), [0.05])[0],
