@@ -63,7 +63,7 @@ class TensorField(eqx.Module):
         self.grid = grid
         self.interpolation = checked_interpolation(interpolation)
         self.function = None
-        self._tensors = spd.symmetrise(_checked_tensors("tensors", grid, tensors))
+        self._tensors = _checked_tensors("tensors", grid, tensors)
 
     @classmethod
     def from_function(
@@ -126,10 +126,11 @@ class TensorField(eqx.Module):
             >>> print(jnp.linalg.det(metric.tensors[4, 4]).round(3))  # 1/|D|
             0.25
         """
-        tensors = spd.symmetrise(_checked_tensors(name, grid, D))
+        tensors = _checked_tensors(name, grid, D)
         check_metric_choice(metric)
         if metric == "tensor":
             return cls._checked(grid, interpolation, tensors)
+        tensors = spd.symmetrise(tensors)
         return cls(grid, _metric_of_diffusion(spd.identity_outside(tensors, grid.inside), metric), interpolation)
 
     @classmethod
@@ -161,7 +162,7 @@ class TensorField(eqx.Module):
             [[1.0, 1.0], [1.0, 2.0]]
         """
         C = _checked_tensors(f"{name}ᵀ{name}", grid, right_cauchy_green(name, grid, F))
-        return cls._checked(grid, interpolation, spd.symmetrise(C))
+        return cls._checked(grid, interpolation, C)
 
     @classmethod
     def from_indefinite(
@@ -205,7 +206,7 @@ class TensorField(eqx.Module):
             [3. 1.]
         """
         mapped = positive_map(name, tensors_on(grid, name, S), how, number, grid.inside)
-        return cls._checked(grid, interpolation, spd.symmetrise(mapped))
+        return cls._checked(grid, interpolation, mapped)
 
     def __repr__(self) -> str:
         values = "a function" if self.function is not None else describe_array(self._tensors)
@@ -213,11 +214,10 @@ class TensorField(eqx.Module):
 
     @property
     def tensors(self) -> Float[Array, "*shape d d"]:
-        """The tensors at the nodes, symmetric."""
-        if self.function is None:
-            assert self._tensors is not None
-            return self._tensors
-        return spd.symmetrise(_evaluate(self.function, self.grid))
+        """The tensors at the nodes: the symmetric parts of the leaf or of the function's values."""
+        # The symmetric part is taken here, and not when the field is made, because the leaf may change afterwards. So
+        # gradients with respect to the leaf are symmetric, and a leaf that an optimiser makes unsymmetric is harmless.
+        return spd.symmetrise(self._tensors if self.function is None else _evaluate(self.function, self.grid))
 
     @property
     def domain_tensors(self) -> Float[Array, "*shape d d"]:
