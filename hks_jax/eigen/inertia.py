@@ -28,8 +28,10 @@ from hks_jax.traced import is_traced
 
 _BESIDE = (1e-6, 1e-5, 1e-4, 1e-3)
 """Relative distances from a shift at which eigenvalues are counted if the factorisation at the shift is inaccurate."""
-_TRIES = 60
+_TRIES = 40
 """The maximal number of factorisations in a search."""
+_UNCERTAIN = 5
+"""The number of consecutive uncertain counts after which a bracket is not divided further."""
 _JUST_BELOW = 0.625
 """The exponent p of the first shift −ε^p λ of a search, where λ is an estimate of the largest eigenvalue."""
 _ALIKE = 1e-3
@@ -203,6 +205,7 @@ class _Search(NamedTuple):
     number: Number  # the number of eigenvalues below `high`
     first: Scalar  # the highest shift with `number` eigenvalues below it; solves there are most accurate
     next: Scalar  # the shift below which eigenvalues are counted next
+    uncertain: Number  # the number of consecutive uncertain counts
     tries: Number  # the number of factorisations so far
     going: Flag  # whether the search goes on
 
@@ -211,8 +214,8 @@ def locate(pencil: SymmetricPencil, wanted: int, probes: int) -> tuple[Scalar, S
     """Return an origin below all eigenvalues, a shift above the lowest 1 to 2·wanted eigenvalues, and their number.
 
     A bracket is halved, or divided in proportion to the counts, until it contains few enough eigenvalues. Each
-    factorisation is tested with `probes` random right-hand sides. If many eigenvalues are equal within rounding, the
-    number exceeds 2·wanted. If the search fails, the origin and the shift are NaN.
+    factorisation is tested with `probes` random right-hand sides. If rounding does not separate many eigenvalues, the
+    number exceeds 2·wanted. If the search fails within `_TRIES` factorisations, the origin and the shift are NaN.
     """
     size, count = scale(pencil), _counting(pencil, probes)
     infinite = jnp.full((), jnp.inf, size.dtype)
@@ -224,10 +227,9 @@ def locate(pencil: SymmetricPencil, wanted: int, probes: int) -> tuple[Scalar, S
         return _narrowed(state, *count(state.next), size, least, wanted, pencil.size)
 
     # Outside `jit`, the search for the origin calls the same compiled factorisation as spectrum slicing, which follows.
-    start = _Search(-infinite, infinite, none, infinite, -least, none, jnp.ones((), bool))
-    state = while_loop(lambda state: state.going, step, start)
-    known = jnp.isfinite(state.low) & jnp.isfinite(state.high)
-    low, first = (jnp.where(known, end, jnp.nan) for end in (state.low, state.first))
+    start = _Search(-infinite, infinite, none, infinite, -least, none, none, jnp.ones((), bool))
+    state = while_loop(lambda state: state.going & (state.tries < _TRIES), step, start)
+    low, first = (jnp.where(state.going, jnp.nan, end) for end in (state.low, state.first))
     return low, first, state.number
 
 
@@ -243,11 +245,15 @@ def _narrowed(state: _Search, count: Number, sound: Flag, size: Scalar, least: S
     down, up = jnp.minimum(-size, 4 * state.next), 4 * jnp.maximum(low, 0) + size * wanted / n
     bracketed = jnp.isfinite(low) & jnp.isfinite(high)
     following = jnp.where(bracketed, low + share * (high - low), jnp.where(jnp.isfinite(high), down, up))
-    # If the number of eigenvalues below a shift is uncertain, the next shift is slightly larger.
+    # If the number of eigenvalues below a shift is uncertain, the next shift is slightly larger. But if even the lower
+    # end is unknown, the shift moves away from zero by a factor: size may be many orders larger than the lowest
+    # eigenvalues, as for a nearly incompressible body.
     beside = state.next + 1e-3 * jnp.where(bracketed, high - low, size * wanted / n)
-    few, tries = (number <= 2 * wanted) | (high - low <= _NARROW * least), state.tries + 1
-    going = ~(bracketed & few) & (tries < _TRIES)
-    return _Search(low, high, number, first, jnp.where(sound, following, beside), tries, going)
+    beside = jnp.where(jnp.isfinite(low), beside, 4 * state.next)
+    uncertain = jnp.where(sound, 0, state.uncertain + 1)
+    few = (number <= 2 * wanted) | (high - low <= _NARROW * least) | (uncertain >= _UNCERTAIN)
+    following = jnp.where(sound, following, beside)
+    return _Search(low, high, number, first, following, uncertain, state.tries + 1, ~(bracketed & few))
 
 
 def _counting(pencil: SymmetricPencil, probes: int) -> Callable[[Scalar], Count]:

@@ -225,6 +225,66 @@ def test_a_cut_multiple_eigenvalue_is_told():
         hj.eigsh(lattice(12), k=3)
 
 
+def turned(values) -> np.ndarray:
+    """A full matrix of these eigenvalues."""
+    frame = np.linalg.qr(np.random.default_rng(0).standard_normal((len(values), len(values))))[0]
+    matrix = frame @ np.diag(values) @ frame.T
+    return (matrix + matrix.T) / 2
+
+
+BOTTOMS = {  # a matrix, the number of copies of its lowest eigenvalue, a k that cuts it
+    "a turned matrix": (lambda: turned([1.0, 1, 7, 7]), 2, 1),
+    "copies of a chain": (lambda: paths(3, 20).toarray(), 3, 2),
+    "copies of a chain far from zero": (lambda: paths(3, 20).toarray() - 2 * np.eye(60), 3, 2),
+    "a high multiplicity": (lambda: turned([3.0] * 20 + [5.0] * 5), 20, 12),
+}
+
+
+@pytest.mark.parametrize("name", BOTTOMS)
+@pytest.mark.parametrize("solver", ["dense", "shift-invert", SOLVER])
+def test_a_cut_lowest_eigenvalue_is_told(name, solver):
+    """Its copies differ by rounding, of which no distance from the lowest of them tells."""
+    made, copies, k = BOTTOMS[name]
+    matrix = made()
+    remedy = rf"k = {k} cuts a multiple eigenvalue: the last {k} pair.*Take the k that `count_eigenvalues` counts"
+    with pytest.warns(hj.AccuracyWarning, match=remedy):  # and no other warning: those would be errors
+        pairs = hj.eigenpairs(matrix, k, solver=solver, multiplet="drop")
+    assert pairs.cut_multiplet == k
+    above = float(pairs.eigenvalues[0]) + 1e-3
+    assert hj.count_eigenvalues(matrix, above) == copies  # the advice
+    whole = hj.eigenpairs(matrix, copies, solver=solver)
+    assert whole.cut_multiplet == 0
+    if copies - k <= 8:
+        assert hj.eigenpairs(matrix, k, solver=solver, multiplet="complete").kept.sum() == copies
+    # What is reported does not depend on how unknowns are numbered; the complete signature does not either.
+    order = np.random.default_rng(1).permutation(len(matrix))
+    other = hj.eigenpairs(matrix[np.ix_(order, order)], copies, solver=solver)
+    np.testing.assert_allclose(hj.hks(other, [0.5])[0], hj.hks(whole, [0.5])[0][order], rtol=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("solver", ["dense", SOLVER])
+def test_a_cut_lowest_eigenvalue_is_known_under_jit(solver, dtype):
+    pencil = hj.sparse_pencil(paths(3, 12).astype(dtype))
+
+    @eqx.filter_jit
+    def kept(pencil, k, choice):
+        pairs = hj.eigenpairs(pencil, k, solver=solver, multiplet=choice)
+        return pairs.cut_multiplet, pairs.kept.sum()
+
+    assert kept(pencil, 2, "report") == (2, 2)
+    assert kept(pencil, 4, "drop") == (0, 3)
+
+
+def test_a_circulant_raises_no_false_alarm():
+    column = np.random.default_rng(0).standard_normal(128)
+    matrix = scipy.linalg.circulant((column + np.roll(column[::-1], 1)) / 2)  # its eigenvalues are double, but for two
+    with pytest.warns(hj.AccuracyWarning, match="k = 1 cuts a multiple eigenvalue"):
+        pairs = hj.eigenpairs(matrix, 1, solver="shift-invert")
+    assert pairs.result == hj.RESULTS.successful
+    assert pairs.eigenvalues[0] == pytest.approx(np.linalg.eigvalsh(matrix)[0], rel=1e-13)
+
+
 def twelve_graphs() -> sp.csc_matrix:
     """The Laplacian of twelve equal graphs: all eigenvalues have twelve copies, and zero lies far below the others."""
     edges = sp.random(150, 150, 0.08, random_state=0).tocsr()
