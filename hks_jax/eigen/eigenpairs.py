@@ -67,7 +67,7 @@ class Eigenpairs(eqx.Module):
         spectral_origin: the reference point of relative errors: 0 if K ⪰ 0 is known, otherwise the lowest eigenvalue;
             for an interval its lower end.
         multiplet_tolerance: the gap, relative to the distance from `spectral_origin`, below which neighbouring
-            eigenvalues count as equal.
+            eigenvalues count as equal. If the null space is unknown, gaps at the level of rounding count as zero too.
         pencil: the matrices K and M.
         solver_name: the name of the solver.
         lowest: whether the pairs are the lowest; false for an interval.

@@ -28,6 +28,8 @@ from hks_jax.traced import is_traced
 
 _BESIDE = (1e-6, 1e-5, 1e-4, 1e-3)
 """Relative distances from a shift at which eigenvalues are counted if the factorisation at the shift is inaccurate."""
+_CLEAR = 1e-2
+"""The largest error of a solve, times √n, at which a shift is certainly no eigenvalue within rounding."""
 _TRIES = 40
 """The maximal number of factorisations in a search."""
 _UNCERTAIN = 5
@@ -98,18 +100,19 @@ def checked_pencil(domain: Any, boundary: BoundarySpec, mass: MassKind, quadratu
 def count_below(pencil: AnyPencil, below: Scalar | float) -> Number:
     """Count the eigenvalues of a pencil below a number; see `count_eigenvalues`."""
     shift = jnp.asarray(below, pencil.parts[0].stiffness.dtype)
-    count, sound = _total(pencil, shift)
+    count, sound, clear = _total(pencil, shift)
     if is_traced((count, sound)):
         return jnp.where(sound, count, -1)
-    if sound:
+    if sound and clear:
         return count
     # Distances are relative to |σ| or, if σ is near zero, to the expected size of the lowest positive eigenvalue.
     volume, dimension = pencil.volume, pencil.space.dimension
     least = 1e-6 * largest(pencil.parts[0]) if volume is None or dimension is None else volume ** (-2 / dimension)
     size = max(abs(float(shift)), float(least))
-    for relative in _BESIDE:
+    for relative in _BESIDE[:1] if sound else _BESIDE:
         low, high = float(shift) - relative * size, float(shift) + relative * size
-        (under, sound_under), (over, sound_over) = (_total(pencil, jnp.asarray(s, shift.dtype)) for s in (low, high))
+        counts = (_total(pencil, jnp.asarray(s, shift.dtype)) for s in (low, high))
+        (under, sound_under, _), (over, sound_over, _) = counts
         if sound_under and sound_over:
             if under == over:
                 return under
@@ -117,27 +120,34 @@ def count_below(pencil: AnyPencil, below: Scalar | float) -> Number:
                 f"below: got {float(shift):.15g}, which is too close to an eigenvalue; {int(under)} eigenvalues are "
                 f"below {low:.12g} and {int(over)} are below {high:.12g}. Use one of these two bounds"
             )
+    if sound:
+        return count
     raise ValueError(
         f"below: got {float(shift):.15g}, at which rounding in {shift.dtype} leaves the count uncertain. "
         "Use another number, or float64"
     )
 
 
-def _total(pencil: AnyPencil, shift: Scalar) -> Count:
-    counts = [certain_count(part, shift) for part in pencil.parts]
-    return sum((count for count, _ in counts), jnp.zeros((), int)), jnp.all(jnp.stack([sound for _, sound in counts]))
+def _total(pencil: AnyPencil, shift: Scalar) -> tuple[Number, Flag, Flag]:
+    """Return the number of eigenvalues below a shift, whether it is certain, and whether the shift is none of them."""
+    counts, sound, rates = zip(*(_counted(part, dissect(part.pattern), shift) for part in pencil.parts), strict=True)
+    # At an eigenvalue within rounding, the sign of a pivot is right for the shift, but not for the computed eigenvalue.
+    # The same solves that test the inertia then have residuals of the order of their right-hand sides.
+    clear = [rate < _CLEAR / math.sqrt(part.size) for rate, part in zip(rates, pencil.parts, strict=True)]
+    return sum(counts, jnp.zeros((), int)), jnp.all(jnp.stack(sound)), jnp.all(jnp.stack(clear))
 
 
 def certain_count(pencil: SymmetricPencil, shift: Scalar) -> Count:
     """Return the number of eigenvalues of one pencil below a shift, and whether this number is certain."""
-    return _certain_count(pencil, dissect(pencil.pattern), shift)
+    return _counted(pencil, dissect(pencil.pattern), shift)[:2]
 
 
 # The nested dissection is an argument, because compilation with so large a constant (74 MB at 1024² nodes) is slow.
 @jit_quickly()
-def _certain_count(pencil: SymmetricPencil, dissection: Dissection, shift: Scalar) -> Count:
+def _counted(pencil: SymmetricPencil, dissection: Dissection, shift: Scalar) -> tuple[Number, Flag, Scalar]:
+    """Return the result of `certain_count`, and the rate of `Trial`."""
     factor, trial, _ = certain_factorisation(dissection, pencil, shift)
-    return factor.negative, trial.sound
+    return factor.negative, trial.sound, trial.rate
 
 
 class LocatedPencil(SymmetricPencil):

@@ -18,6 +18,7 @@ from skfem.helpers import dot
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 import hks_jax as hj
+from hks_jax.eigen import inertia
 from hks_jax.eigen.inertia import locate
 from hks_jax.eigen.quality import measure_pairs, measured_on_host
 
@@ -283,6 +284,47 @@ def test_a_circulant_raises_no_false_alarm():
         pairs = hj.eigenpairs(matrix, 1, solver="shift-invert")
     assert pairs.result == hj.RESULTS.successful
     assert pairs.eigenvalues[0] == pytest.approx(np.linalg.eigvalsh(matrix)[0], rel=1e-13)
+
+
+@pytest.mark.parametrize("boundary", ["mirror", "mean"])
+def test_an_interval_that_ends_at_an_eigenvalue_of_a_doubled_domain_is_refused(boundary):
+    """The pivot that vanishes there has a sign, by which one part was counted within and another without."""
+    for seed in (4, 5):
+        rng = np.random.default_rng(seed)
+        shape = tuple(int(n) for n in rng.integers(5, 8, 2))
+        mask = np.ones(shape, bool)
+        mask[0, 0] = boundary == "mirror"
+        grid = hj.Grid(shape, tuple(rng.uniform(0.1, 0.3, 2).round(3)), mask=mask)
+        pencil = hj.assemble(hj.TensorField(grid, np.broadcast_to(np.eye(2), (*shape, 2, 2))), boundary)
+        dense = [[np.asarray(m.to_dense()) for m in (part.stiffness, part.mass)] for part in pencil.parts]
+        exact = np.sort(np.concatenate([scipy.linalg.eigh(K, M, eigvals_only=True) for K, M in dense]))
+        for i in range(2, 8):
+            for ends in ((exact[i], 1.5 * exact[-1]), (exact[i] / 2, exact[i])):
+                with pytest.raises(ValueError, match=r"interval: got .* too close to an eigenvalue"):
+                    hj.eigenpairs(pencil, interval=ends, solver="dense")
+        low, high = exact[2] * (1 - 1e-5), exact[7] * (1 - 1e-5)
+        pairs = hj.eigenpairs(pencil, interval=(low, high), solver="dense")
+        np.testing.assert_allclose(pairs.eigenvalues, exact[(exact >= low) & (exact < high)], rtol=1e-10)
+
+
+def test_a_nearly_incompressible_body_is_located_by_few_factorisations(monkeypatch):
+    """Its largest eigenvalue is 1e10 times as large as those wanted, of which rounding separates few from zero."""
+    mesh = MeshTet.init_tensor(*(np.linspace(0, 1, 5),) * 3)
+    basis = Basis(mesh, ElementVector(ElementTetP1()))
+    mass = BilinearForm(lambda u, v, _: dot(u, v)).assemble(basis)
+    pencil = hj.sparse_pencil(linear_elasticity(1e9, 1.0).assemble(basis), mass)
+    K, M = pencil.stiffness.to_scipy().toarray(), pencil.mass.to_scipy().toarray()
+    exact, shifts, counting = scipy.linalg.eigh(K, M, eigvals_only=True), [], inertia._counting
+
+    def counted(pencil, probes):
+        count = counting(pencil, probes)
+        return lambda shift: (shifts.append(float(shift)), count(shift))[1]
+
+    monkeypatch.setattr(inertia, "_counting", counted)
+    low, above, number = map(float, inertia.locate(pencil, 4, 8))
+    assert len(shifts) < 20
+    assert low < exact[0]
+    assert number == np.sum(exact < above)
 
 
 def twelve_graphs() -> sp.csc_matrix:

@@ -57,16 +57,16 @@ def test_residuals_of_pure_rounding_are_no_failure(rng):
         turns += 1
         return -r if turns == 3 else r
 
+    def product(x):
+        return values * x, 1e-8 * (x * x).sum(axis=0)
+
     for xp in (np, jnp):
-        turns, b = 0, xp.asarray(rhs)
-        x = conjugate_gradients(
-            lambda x, v=xp.asarray(values): (v * x, 1e-8 * (x * x).sum(axis=0)), precondition, b, xp.full(2, 1e-12)
-        ).converged
+        turns = 0
+        x = conjugate_gradients(product, precondition, xp.asarray(rhs), xp.full(2, 1e-12)).converged
         np.testing.assert_allclose(x, rhs / values, rtol=1e-13)
     # A negative product of a residual that is not yet small is a failure.
     turns = 1
-    x = conjugate_gradients(lambda x: (values * x, 1e-8 * (x * x).sum(axis=0)), precondition, rhs, np.full(2, 1e-12))
-    assert np.isnan(x.converged).all()
+    assert np.isnan(conjugate_gradients(product, precondition, rhs, np.full(2, 1e-12)).converged).all()
 
 
 @pytest.mark.slow
