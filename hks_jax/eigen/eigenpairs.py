@@ -303,7 +303,9 @@ def _unconfirmed(xp: Any, spectrum: _Spectrum, kept: Any, bound: Any, optional: 
 def _cut_multiplet(xp: Any, spectrum: _Spectrum, kept: Any) -> Any:
     count = xp.sum(kept)
     ends, index = _ends_of_multiplets(xp, spectrum), xp.arange(len(kept))
-    return xp.where(ends[count - 1], 0, count - xp.max(xp.where(ends & (index < count), index + 1, 0)))
+    beyond = xp.append(spectrum.values, spectrum.following)[count]
+    whole = ends[count - 1] | xp.isnan(beyond - spectrum.values[count - 1])  # pairs that were not found are NaN
+    return xp.where(whole, 0, count - xp.max(xp.where(ends & (index < count), index + 1, 0)))
 
 
 def _ends_of_multiplets(xp: Any, spectrum: _Spectrum) -> Any:
