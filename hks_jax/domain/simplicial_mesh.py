@@ -130,7 +130,9 @@ class SimplicialMesh(eqx.Module):
     @property
     def metric(self) -> Float[Array, "n d d"]:
         """The metric of each cell in the basis of its edges v₁ − v₀, v₂ − v₀ …; NaN if not positive definite."""
-        return _induced_metric(self._edges) if self._metric is None else spd.positive_or_nan(self._metric)
+        # The symmetric part is taken here, as in `TensorField.tensors`, because the leaf may change.
+        given = self._metric
+        return _induced_metric(self._edges) if given is None else spd.positive_or_nan(spd.symmetrise(given))
 
     @property
     def _edges(self) -> Float[Array, "n 3 d"]:
@@ -229,7 +231,7 @@ def _checked_metric(metric: Any, triangulation: Triangulation) -> Float[Array, "
         raise ValueError(f"metric: got shape {array.shape}; expected {expected}")
     if not is_traced(array):
         require_spd("metric", np.asarray(array), np.ones(n, dtype=bool), words.one)
-    return spd.symmetrise(array)
+    return array
 
 
 @numpy_where_known(static_argnums=(3, 4))

@@ -77,7 +77,7 @@ class TensorField(eqx.Module):
         self.interpolation = checked_interpolation(interpolation)
         self.operator = checked_operator(operator)
         self.function = None
-        self._tensors = spd.symmetrise(_checked_tensors("tensors", grid, tensors))
+        self._tensors = _checked_tensors("tensors", grid, tensors)
 
     @classmethod
     def from_function(
@@ -164,10 +164,11 @@ class TensorField(eqx.Module):
             >>> print(pencil.measure.round(3), pencil.volume.round(3))  # the integrals of dx and of |D|^(−½) dx
             1.0 0.5
         """
-        tensors = spd.symmetrise(_checked_tensors(name, grid, D))
+        tensors = _checked_tensors(name, grid, D)
         metric = of_diffusion(metric, operator)
         if metric == "tensor":
             return cls._checked(grid, interpolation, tensors)
+        tensors = spd.symmetrise(tensors)
         given = _metric_of_diffusion(spd.identity_outside(tensors, grid.inside), metric)
         return cls(grid, given, interpolation, operator=operator)
 
@@ -200,7 +201,7 @@ class TensorField(eqx.Module):
             [[1.0, 1.0], [1.0, 2.0]]
         """
         C = _checked_tensors(f"{name}ᵀ{name}", grid, right_cauchy_green(name, grid, F))
-        return cls._checked(grid, interpolation, spd.symmetrise(C))
+        return cls._checked(grid, interpolation, C)
 
     @classmethod
     def from_indefinite(
@@ -244,7 +245,7 @@ class TensorField(eqx.Module):
             [3. 1.]
         """
         mapped = positive_map(name, tensors_on(grid, name, S), how, number, grid.inside)
-        return cls._checked(grid, interpolation, spd.symmetrise(mapped))
+        return cls._checked(grid, interpolation, mapped)
 
     def __repr__(self) -> str:
         values = "a function" if self.function is not None else describe_array(self._tensors)
@@ -262,11 +263,10 @@ class TensorField(eqx.Module):
 
     @property
     def tensors(self) -> Float[Array, "*shape d d"]:
-        """The tensors at the nodes, symmetric."""
-        if self.function is None:
-            assert self._tensors is not None
-            return self._tensors
-        return spd.symmetrise(_evaluate(self.function, self.grid))
+        """The tensors at the nodes: the symmetric parts of the leaf or of the function's values."""
+        # The symmetric part is taken here, and not when the field is made, because the leaf may change afterwards. So
+        # gradients with respect to the leaf are symmetric, and a leaf that an optimiser makes unsymmetric is harmless.
+        return spd.symmetrise(self._tensors if self.function is None else _evaluate(self.function, self.grid))
 
     @property
     def domain_tensors(self) -> Float[Array, "*shape d d"]:

@@ -29,6 +29,9 @@ from hks_jax.traced import is_traced
 _FAR = 30
 """The largest distance of the origin below the wanted eigenvalues, in units of the spread of these eigenvalues."""
 
+_COPIES = 1000
+"""The largest number of lowest eigenvalues that are all computed because rounding does not separate them."""
+
 
 def widened(pencil: AnyPencil, solvers: Sequence[Eigensolver], k: int) -> AnyPencil:
     """Return the pencil `on_all_nodes`, so that all masks share compiled code; unchanged for the dense solver."""
@@ -67,7 +70,7 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
         half = max(solver.plan(k).slice_size // 2, 1)
         origin, first, below = locate(jax.lax.stop_gradient(pencil), half, solver.block)
         reach, spacing = first - origin, (first - origin) / jnp.maximum(below, 1).astype(origin.dtype)
-        if not is_traced(below) and below > 2 * half:
+        if not is_traced(below) and 2 * half < below <= _COPIES:
             # The lowest eigenvalue has an unexpectedly high multiplicity. Compute all pairs that `locate` counted.
             number = max(k, int(below))
             method = solver if number + 1 <= solver.max_pairs(n_dof) else Dense(solver.tolerance)
