@@ -25,7 +25,7 @@ class NullSpace(eqx.Module):
 
 
 class Unrounded(eqx.Module):
-    """A stiffness K − σM before its entries are rounded, for computations on the host; derivatives treat it as constant.
+    """A stiffness K − σM before its entries are rounded, for computations on the host; constant in derivatives.
 
     Attributes:
         stiffness: K.
