@@ -67,7 +67,8 @@ def balanced(pencil: SymmetricPencil) -> Float[Array, "1 n_dof"]:
     """Return 1 on the components of the matrix K whose rows sum to zero within rounding, and 0 elsewhere.
 
     Each sum is compared with the effect of rounding on the row's entries. Rounding errors of different rows cancel in
-    the sum of all entries, so its limit is less than the sum of the limits: a small constant on the diagonal exceeds it.
+    the sum of all entries, so its limit is less than the sum of the limits. A constant on the diagonal
+    exceeds it.
     """
     (data, pattern), n, eps = pencil.stiffness.triplets(), pencil.size, np.finfo(pencil.stiffness.dtype).eps
     K = _csc(data, pattern, n)
