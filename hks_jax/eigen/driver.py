@@ -79,7 +79,7 @@ def eigenpairs(
 
     Warns:
         AccuracyWarning: values are concrete, and some pairs did not converge, the solver could not confirm that it
-            missed no eigenvalue, or k cuts a multiple eigenvalue.
+            missed no eigenvalue, k cuts a multiple eigenvalue, or float32 does not distinguish an eigenvalue from zero.
 
     Examples:
         >>> flat = hj.TensorField(field.grid, np.tile(np.eye(2), (9, 9, 1, 1)))

@@ -35,6 +35,10 @@ class RESULTS(eqx.Enumeration):
         "The solver could not confirm that it missed no eigenvalue above `.complete_below`. Use another solver, or a "
         "slightly different k."
     )
+    uncertain = (
+        "Some eigenvalues cannot be distinguished from zero in float32 (see `.rounding`). Use float64, or state the "
+        "null vectors."
+    )
 
 
 class Eigenpairs(eqx.Module):
@@ -55,6 +59,9 @@ class Eigenpairs(eqx.Module):
             the null space is unknown, max(λ, λ₁) is replaced by the larger of two numbers: the mean gap of the
             eigenvalues, and the distance of λ from `spectral_origin`.
         converged: (k,) whether the residual is at most the solver's tolerance, or at most the level of rounding.
+        rounding: (k,) for eigenvalues of float32 matrices that are zero within the rounding of the largest eigenvalue,
+            the error that rounding of the matrices' entries may cause; 0 for other eigenvalues, and for eigenvalues
+            that are zero in float64 too. Derivatives treat `rounding` as a constant.
         kept: (k,) whether each pair belongs to the truncated spectrum; signatures ignore the other pairs. The choices
             ``multiplet="drop"`` and ``"complete"`` may exclude the last pairs; `of_part` keeps only one part's pairs.
         part: (k,) for the boundaries "mirror" and "mean", the index of the pencil's part that each pair belongs to (0
@@ -78,6 +85,7 @@ class Eigenpairs(eqx.Module):
     frame: Float[Array, "k n_dof"]
     residuals: Float[Array, " k"]
     converged: Bool[Array, " k"]
+    rounding: Float[Array, " k"]
     kept: Bool[Array, " k"]
     part: Int[Array, " k"] | None
     next_eigenvalue: Float[Array, ""]
@@ -177,11 +185,17 @@ class Eigenpairs(eqx.Module):
         return _unconfirmed(self._spectrum, self.kept, jax.lax.stop_gradient(self.complete_below), optional)
 
     @property
+    def uncertain(self) -> Bool[Array, " k"]:
+        """Whether each eigenvalue is zero within `rounding`, and may be positive, negative or zero."""
+        return self.kept & (self.rounding > 0) & (jnp.abs(self.eigenvalues) <= self.rounding)
+
+    @property
     def result(self) -> RESULTS:
         """The traceable code of the most serious failure, for a comparison with ``RESULTS.successful``."""
         finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(self.pencil) if eqx.is_inexact_array(leaf)]
         code: Any = RESULTS  # mypy sees its members as strings
-        result = code.where(self.unconfirmed, code.unconfirmed, code.successful)
+        result = code.where(jnp.any(self.uncertain), code.uncertain, code.successful)
+        result = code.where(self.unconfirmed, code.unconfirmed, result)
         result = code.where(jnp.all(self.converged), result, code.unconverged)
         return code.where(jnp.all(jnp.stack(finite)), result, code.not_finite)
 
@@ -213,6 +227,14 @@ class Eigenpairs(eqx.Module):
             sentences.append(
                 f"k = {kept} cuts a multiple eigenvalue: the last {cut} pair(s), at λ = {last:.6g}, are an arbitrary "
                 f"part of its eigenspace. Take {fewer}the k that `count_eigenvalues` counts just above this λ"
+            )
+        if (uncertain := np.asarray(self.uncertain)).any():
+            some = ", ".join(f"{value:.3g}" for value in values[uncertain][:3])
+            most, of = float(np.asarray(self.rounding)[uncertain].max()), int(uncertain.sum())
+            stated = "" if self.null_space_known else ", or give `sparse_pencil` the null vectors"
+            sentences.append(
+                f"{of} of {values.size} eigenvalues (λ = {some}{', …' * (of > 3)}) cannot be distinguished from zero: "
+                f"rounding of the matrices to float32 changes them by up to {most:.1e}. Use float64{stated}"
             )
         stretch = _anisotropy(self.pencil) if values.dtype == np.float32 else 1.0
         if (rounding := np.finfo(np.float32).eps * stretch) > _ROUNDED:

@@ -162,8 +162,8 @@ def translated(
     pencil: SymmetricPencil, origin: Scalar, negative: Number, first: Scalar, spacing: Scalar
 ) -> LocatedPencil:
     """Return the pencil of K − σ₀M and M, where σ₀ is the origin, with counts of its spectrum near σ₀."""
-    moved = pencil.stiffness.with_flat(pencil.shifted(jax.lax.stop_gradient(origin)))
-    return LocatedPencil(moved, pencil.mass, *jax.lax.stop_gradient((negative, first, spacing)))
+    moved, source = pencil.moved_by(jax.lax.stop_gradient(origin))
+    return LocatedPencil(moved, pencil.mass, *jax.lax.stop_gradient((negative, first, spacing)), source=source)
 
 
 class _Descent(NamedTuple):

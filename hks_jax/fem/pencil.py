@@ -100,13 +100,13 @@ class Pencil(SymmetricPencil):
                 "stiffness: got a matrix whose sparsity pattern is not that of the pencil; use `sparse_pencil` for "
                 "matrices of other patterns"
             )
-        return replace(self, stiffness=stiffness, null_space=None, lower_bound=None)
+        return replace(self, stiffness=stiffness, source=None, null_space=None, lower_bound=None)
 
     def counted_from(self, origin: Float[Array, ""]) -> "Pencil":
         """Return the pencil of K − σM and M with an empty null space, where σ = ``origin`` is below the spectrum."""
-        moved = self.stiffness.with_flat(self.shifted(origin))
+        moved, source = self.moved_by(origin)
         nothing = NullSpace(jnp.zeros((0, self.size), origin.dtype))
-        return replace(self, stiffness=moved, null_space=nothing, lower_bound=None, row_sums=None)
+        return replace(self, stiffness=moved, source=source, null_space=nothing, lower_bound=None, row_sums=None)
 
     @property
     def parts(self) -> tuple["Pencil", ...]:

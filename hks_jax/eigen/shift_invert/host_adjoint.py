@@ -49,11 +49,11 @@ class HostAdjoint(Adjoint[Pencil]):
         data, matrices = host_matrices(pencil)
         tolerance = complement.attainable(self.tolerance, rhs.dtype)
 
-        def on_host(data_k: ArrayLike, data_m: ArrayLike, nulls: ArrayLike, *arrays: ArrayLike) -> np.ndarray:
-            values, vectors, b = (np.asarray(array, np.float64) for array in arrays)
+        def on_host(*inputs: ArrayLike) -> np.ndarray:
+            values, vectors, b = (np.asarray(array, np.float64) for array in inputs[len(data) :])
             if not all(np.isfinite(array).all() for array in (values, vectors, b)):
                 return np.full(rhs.shape, np.nan, rhs.dtype)
-            K, M = matrices(data_k, data_m, nulls)
+            K, M = matrices(*inputs[: len(data)])
             return _solve(K, M, values, vectors, b, tolerance, rhs.dtype).astype(rhs.dtype)
 
         inputs = *data, values, vectors, rhs

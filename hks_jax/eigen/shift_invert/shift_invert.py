@@ -52,6 +52,7 @@ class ShiftInvert(Eigensolver[Pencil]):
 
     name: ClassVar[str] = "shift-invert"
     indefinite: ClassVar[bool] = False
+    in_double: ClassVar[bool] = True
     tolerance: float = eqx.field(default=1e-8, static=True)
     max_restarts: int = eqx.field(default=300, static=True)
     basis: int | None = eqx.field(default=None, static=True)
