@@ -9,6 +9,7 @@ from typing import Any
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.domain.grid import Grid
+from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.automatic import choose_for_fit
 from hks_jax.eigen.solver import Eigensolver
@@ -87,7 +88,13 @@ def fit_metric(
     if isinstance(init, Grid):
         init = flat_field(init)
     elif not isinstance(init, TensorField):
-        raise TypeError(f"init: got {type(init).__name__}; expected hks_jax.Grid or hks_jax.TensorField")
+        remedy = ""
+        if isinstance(init, SimplicialMesh):
+            remedy = (
+                ". A metric can be fitted on grids only. Minimise a loss of hks(eigenpairs(mesh, k), times) by "
+                "jax.value_and_grad with respect to the mesh's vertices or metric, or sample the domain on a grid"
+            )
+        raise TypeError(f"init: got {type(init).__name__}; expected hks_jax.Grid or hks_jax.TensorField{remedy}")
     pencil = assemble(init, boundary)
     unknowns = unknowns_for(parametrisation, init, pencil.space.domain)
     observed, noise = observe(target, times, data, pencil.space, init.domain_tensors.dtype)
