@@ -67,8 +67,9 @@ def resolution_of(metric: SampledMetric, space: FunctionSpace, lumped: bool, can
 #     Σₐ hₐ⁴gₐₐ²/128t² + Σₐᵦ hₐ²hᵦ² (gₐₐgᵦᵦ + 2gₐᵦ²)/2304t².
 #
 # For a metric that is not diagonal, the error is half to twice as large as the formula for a diagonal metric. The error
-# of single eigenvalues is of second order: −Σ_{a<b} g^ab kₐkᵦ (hₐ²kₐ² + hᵦ²kᵦ²)/6 cancels only in the mean over the heat
-# kernel. Since E kₐ³kᵦ = 3gₐₐgₐᵦ/4t², the sum of its terms' sizes, times t, is Σ_{a<b} |g^ab gₐᵦ| (hₐ²gₐₐ + hᵦ²gᵦᵦ)/8t.
+# of single eigenvalues is of second order: −Σ_{a<b} g^ab kₐkᵦ (hₐ²kₐ² + hᵦ²kᵦ²)/6 cancels only in the mean over the
+# heat kernel. Since E kₐ³kᵦ = 3gₐₐgₐᵦ/4t², the sum of its terms' sizes, times t, is Σ_{a<b}
+# |g^ab gₐᵦ| (hₐ²gₐₐ + hᵦ²gᵦᵦ)/8t.
 def _dispersion(xp: Any, tensors: Any, spacing: Any, lumped: bool, cancelling: bool) -> tuple[Any, Any]:
     """Return the coefficients `Resolution.dispersion` and `Resolution.of_eigenvalues`."""
     inverse, d = spd.inverse(tensors), tensors.shape[-1]

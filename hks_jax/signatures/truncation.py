@@ -90,7 +90,8 @@ class Truncation(eqx.Module):
             )
         if (lasting > BIAS_LIMIT).any():
             messages.append(
-                "the tensors vary too much from node to node: the discretisation biases the signature at "
+                "the tensors vary too much from node to node, or, between Dirichlet sides, few modes remain: the "
+                "discretisation biases the signature at "
                 f"{int((lasting > BIAS_LIMIT).sum())} of {times.size} times by about {lasting.max():.1%}, which larger "
                 'times do not reduce. Use a finer grid; interpolation="log-euclidean" at least preserves the volume'
             )
@@ -108,7 +109,7 @@ def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]
     decreasing part of the error is d h²/48t if the metric is constant and diagonal in the grid's axes, and larger
     otherwise; between Dirichlet sides it grows at large t. The lasting part of the error arises where the tensors vary
     between nodes: the elements overestimate eigenvalues, and interpolation changes the volume element. docs/accuracy.md
-    compares estimates with errors on random fields: most errors are 1/4 to 1.5 times the estimate, but no estimate is a
+    compares estimates with errors on random fields: most errors are 1/4 to 1.9 times the estimate, but no estimate is a
     bound. On meshes only the decreasing part of the error is estimated.
 
     With a potential or an unknown null space, the exponent of Weyl's law is estimated from the mean of the eigenvalues,
@@ -177,8 +178,8 @@ def _truncation(
 
 
 # The heat trace of a continuous metric is Z(t) = Σ e^(−λt), to which the eigenvalues beyond the pairs contribute as in
-# `beyond`. For the exponent a = d/2 of Weyl's law, the moments Σ (λt)ʲ e^(−λt)/Z are a (a + 1) … (a + j − 1) at small t.
-# With x = Λt, the integrals Sⱼ of y^(a+j−1) e^(−y) over y > x, times N(Λ) a x^(−a), satisfy the recurrence
+# `beyond`. For the exponent a = d/2 of Weyl's law, the moments Σ (λt)ʲ e^(−λt)/Z are a (a + 1) … (a + j − 1) at small
+# t. With x = Λt, the integrals Sⱼ of y^(a+j−1) e^(−y) over y > x, times N(Λ) a x^(−a), satisfy the recurrence
 # Sⱼ₊₁ = (a + j) Sⱼ + N(Λ) a xʲ e^(−x), by parts.
 def _moments(xp: Any, exponents: Any, terms: Any, count: Any, x: Any, dimension: int) -> list[Any]:
     """Return three moments of λt in the heat trace, each relative to its value at small t."""
@@ -202,8 +203,8 @@ def _moments(xp: Any, exponents: Any, terms: Any, count: Any, x: Any, dimension:
 # If the volume grows by the factor 1 + v, the metric grows by the factor (1 + v)^(2/d). The signature is divided by
 # 1 + v and the eigenvalues by (1 + v)^(2/d), with a relative error of size v(1 − m₁).
 #
-# An uneven error v of the volume element is a sum of waves exp(iξ·x). By Duhamel's formula (hks_jax/inverse/conformal.py
-# has the case of the plane), a flat metric that is multiplied by 1 + 2v/d has an HKS with the relative change cv, where
+# An uneven error v of the volume element is a sum of waves exp(iξ·x). By Duhamel's formula (hks_jax/inverse/conformal.py has
+# the case of the plane), a flat metric that is multiplied by 1 + 2v/d has an HKS with the relative change cv, where
 #
 #     c = (2/d)(d − 1) a(t|ξ|²),    a(x) = ∫₀¹ (1 + x (1 − s)²) exp(−x s (1 − s)) ds − 1 ≤ a(5.54) = 0.32.
 def _resolution_bias(
@@ -217,10 +218,14 @@ def _resolution_bias(
         for x in (resolution.dispersion, resolution.of_eigenvalues, resolution.turning)
     )
     uneven = _LARGEST_CHANGE * (2 / d) * (d - 1) * xp.maximum(first, 1) * resolution.unevenness
-    lasting = first * turning + xp.abs(1 - first) * resolution.swelling + uneven
+    of_few = xp.abs(second - first) * of_eigenvalues / t
+    # Between Dirichlet sides few eigenvalues remain at large t, where their relative errors, times t, grow.
+    grows = xp.where(second > 2, of_few, 0)
+    lasting = first * turning + xp.abs(1 - first) * resolution.swelling + uneven + grows
     lasting = xp.where(free.ravel()[None], lasting, 0)
-    decreasing = (first if order == 1 else third) * (dispersion / t) ** order
-    both = xp.hypot(xp.hypot(decreasing, xp.abs(second - first) * of_eigenvalues / t), lasting)
+    # Moments below 1 are those of the computed eigenvalues, which may be much too large on a coarse grid.
+    decreasing = xp.maximum(first if order == 1 else third, 1) * (dispersion / t) ** order
+    both = xp.hypot(xp.hypot(decreasing, xp.where(second > 2, 0, of_few)), lasting)
     # The signature of the discretised domain stays bounded as t tends to 0, so its relative error tends to 1.
     return both / (1 + both), lasting / (1 + lasting)
 
@@ -346,7 +351,8 @@ def truncation_map(
     The result is an estimate, not a bound. On 320 random fields on small grids (smooth, turning, jumping, rough, and
     anisotropic up to 1e4), the largest true share over the nodes was 0.3 to 2.3 times the largest estimate in 98 % of
     the comparisons with a mean share above 0.1 %, and 0.07 to 10 times in all of them. For mean shares of 1e-6 to 0.1 %
-    it was 0.2 to 4 times the largest estimate in 98 % of the comparisons. The result is NaN outside the mask, 0 at Dirichlet nodes or if no pairs are left out, and constant in derivatives.
+    it was 0.2 to 4 times the largest estimate in 98 % of the comparisons. The result is NaN
+    outside the mask, 0 at Dirichlet nodes or if no pairs are left out, and constant in derivatives.
 
     Args:
         times: (n_times,) positive, in (metric length)².
