@@ -26,7 +26,8 @@ from hks_jax.inverse.unknowns import Free, Parametrisation, flat_field, unknowns
 _EXPLAINED = 1e-6
 """A misfit above this share of the discretisation's counts as not explained: residuals above a thousandth of its error.
 On the same grid, fits of a metric that explains the target ended with residuals of 2e-9 to 7e-5 of the error, fits to
-targets of a finer grid or of a metric beyond the parametrisation with residuals of 1e-2 and more."""
+targets of a finer grid or of a metric beyond the parametrisation with residuals of 1e-2 and more.
+Residuals below twice the tolerance of the search do not count, because the fit stops there."""
 _UNEXPLAINED = (
     "The fitted metric does not explain the target, and its differences from init may be artefacts. Use another "
     'parametrisation, such as "log-euclidean", another init'
@@ -145,7 +146,7 @@ def fit_metric(
             f"noise: the fit {result} with residuals of {(2 * misfit) ** 0.5:.2g}, above the noise {noise:.2g}. "
             f"{_UNEXPLAINED}, weaker regularisers, or a larger noise"
         )
-    elif noise is None and ended and misfit > _EXPLAINED * discretisation:
+    elif noise is None and ended and misfit > max(_EXPLAINED * discretisation, 2 * search.tolerance**2):
         size, error = (2 * misfit) ** 0.5, (2 * discretisation) ** 0.5
         above = "above" if misfit > discretisation else "not explained by the metric, beside"
         warn_of_accuracy(

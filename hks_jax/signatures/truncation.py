@@ -203,8 +203,9 @@ def _moments(xp: Any, exponents: Any, terms: Any, count: Any, x: Any, dimension:
 # If the volume grows by the factor 1 + v, the metric grows by the factor (1 + v)^(2/d). The signature is divided by
 # 1 + v and the eigenvalues by (1 + v)^(2/d), with a relative error of size v(1 − m₁).
 #
-# An uneven error v of the volume element is a sum of waves exp(iξ·x). By Duhamel's formula (hks_jax/inverse/conformal.py has
-# the case of the plane), a flat metric that is multiplied by 1 + 2v/d has an HKS with the relative change cv, where
+# An uneven error v of the volume element is a sum of waves exp(iξ·x). By Duhamel's formula (in
+# hks_jax/inverse/conformal.py for the plane), a flat metric that is multiplied by 1 + 2v/d has an HKS with the
+# relative change cv, where
 #
 #     c = (2/d)(d − 1) a(t|ξ|²),    a(x) = ∫₀¹ (1 + x (1 − s)²) exp(−x s (1 − s)) ds − 1 ≤ a(5.54) = 0.32.
 def _resolution_bias(
