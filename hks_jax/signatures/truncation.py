@@ -219,14 +219,14 @@ def _resolution_bias(
         for x in (resolution.dispersion, resolution.of_eigenvalues, resolution.turning)
     )
     uneven = _LARGEST_CHANGE * (2 / d) * (d - 1) * xp.maximum(first, 1) * resolution.unevenness
-    of_few = xp.abs(second - first) * of_eigenvalues / t
-    # Between Dirichlet sides few eigenvalues remain at large t, where their relative errors, times t, grow.
-    grows = xp.where(second > 2, of_few, 0)
-    lasting = first * turning + xp.abs(1 - first) * resolution.swelling + uneven + grows
-    lasting = xp.where(free.ravel()[None], lasting, 0)
     # Moments below 1 are those of the computed eigenvalues, which may be much too large on a coarse grid.
     decreasing = xp.maximum(first if order == 1 else third, 1) * (dispersion / t) ** order
-    both = xp.hypot(xp.hypot(decreasing, xp.where(second > 2, 0, of_few)), lasting)
+    of_spacing = xp.hypot(decreasing, xp.abs(second - first) * of_eigenvalues / t)
+    # Between Dirichlet sides few eigenvalues remain at large t, where their relative errors, times t, grow.
+    grows = second > 2
+    lasting = first * turning + xp.abs(1 - first) * resolution.swelling + uneven + xp.where(grows, of_spacing, 0)
+    lasting = xp.where(free.ravel()[None], lasting, 0)
+    both = xp.hypot(xp.where(grows, 0, of_spacing), lasting)
     # The signature of the discretised domain stays bounded as t tends to 0, so its relative error tends to 1.
     return both / (1 + both), lasting / (1 + lasting)
 
