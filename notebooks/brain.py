@@ -1,7 +1,7 @@
 # %% [markdown]
 # # A brain, from the scan to its signature
 #
-# This notebook starts from diffusion-weighted images with b-values and directions. DIPY fits the tensors. Then follow
+# This notebook starts from diffusion-weighted images with b-values and directions, to which tensors are fitted. Then follow
 # the mask, a slice, the metric, the eigenpairs, the heat kernel signature at several times, pictures, and a NIfTI
 # file in the space of the scan. To use your own scan, run
 #

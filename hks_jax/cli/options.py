@@ -59,14 +59,16 @@ file FILE...
 --positive HOW:NUMBER
     map for tensors T that are naturally indefinite, such as stress: exp:S uses exp(T/S) and shift:C uses T + C·I as the
     metric; combine it with --metric tensor
-[dwi] diffusion-weighted images: DIPY fits the tensors. Without --mask, DIPY's median_otsu finds the brain.
+[dwi] diffusion-weighted images: a fit gives the tensors. Without --mask, DIPY's median_otsu finds the brain.
 --bval FILE  b-values, in s/mm2 unless --unit is given
 --bvec FILE
     gradient directions of length 1 in three rows or three columns, as dcm2niix writes them (see --bvec-frame)
 --bvec-frame fsl|voxel|world
     axes of the directions: the voxel axes, the first reversed if the affine's determinant is positive (fsl, the
     default, for FSL, dcm2niix and BIDS), the voxel axes (voxel), or the scanner's axes (world, for MRtrix)
---b-max B  largest b-value used, in s/mm2; the tensor model holds for b ≲ 1500
+--b-max B
+    largest b-value used, in s/mm2 (default: all are used, with a warning above 1500, up to which the tensor model
+    holds)
 [domain]
 --components raise|largest|all = raise
     if the mask is not connected: raise an error (default), keep the largest component, or keep all components

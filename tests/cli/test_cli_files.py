@@ -79,7 +79,9 @@ def test_a_scan_to_pictures_by_one_command(scan, tmp_path, capsys):
     ]
     report = json.loads((out / "report.json").read_text())
     assert report["input"]["order"] == "fit"
-    assert report["input"]["notes"][0] == "weighted least-squares fit to 13 of 13 images (b ≤ 1000 s/mm²)"
+    assert report["input"]["notes"][0] == (
+        "weighted least-squares fit to 13 of 13 images (1 at b = 0, 12 at b = 1000 s/mm²)"
+    )
     repair = report["input"]["repair"]
     assert (repair["method"], repair["voxels"], repair["first"]) == ("nearest", 1, [[7, 6]])
     assert (
