@@ -14,7 +14,7 @@ from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import require_number
 from hks_jax.io import nifti
 from hks_jax.io.masks import mask_on
-from hks_jax.io.tensor_order import ORDERS, Matrices, pack, to_voxel_axes, unpack
+from hks_jax.io.tensor_order import Matrices, indices, pack, to_voxel_axes, unpack
 from hks_jax.io.units import MM2_PER_S, UNITS, Unit, b_value_question, median_mean_diffusivity
 from hks_jax.io.volume import TensorVolume, digest, placed
 from hks_jax.optional import optional
@@ -208,8 +208,8 @@ def _shells(b: Float[np.ndarray, " n"]) -> str:
 
 def _design(b: Float[np.ndarray, " n"], directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 7"]:
     """Return the matrix from the tensor's components xx xy yy xz yz zz and the log unweighted signal to log signals."""
-    rows, columns = zip(*(("xyz".index(i), "xyz".index(j)) for i, j in ORDERS["nifti"]), strict=True)
-    double = np.where(np.equal(rows, columns), 1, 2)  # an off-diagonal component counts twice
+    rows, columns = np.transpose(indices("nifti", 3))
+    double = np.where(rows == columns, 1, 2)  # an off-diagonal component counts twice
     weighted = -b[:, None] * directions[:, rows] * directions[:, columns] * double
     return np.column_stack([weighted, np.ones(b.size)])
 
