@@ -20,6 +20,7 @@ from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read
 from hks_jax.io import find_invalid, save_tensors
 from hks_jax.io.formats import WRITTEN
+from hks_jax.io.repair import describe_invalid
 
 OPTIONS = f"""
 @file {READING}
@@ -36,9 +37,8 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     if args.output.exists() and args.output.samefile(args.file):
         raise ValueError(f"OUT: got {args.output}, the same file as FILE. Choose another name")
     volume = read(args, progress)
-    invalid = int(find_invalid(volume).sum())
-    if invalid:
-        progress.warn(f"{invalid} tensors are not positive definite and are written unchanged; see --repair")
+    if (bad := find_invalid(volume)).any():
+        progress.warn(f"{int(bad.sum())} tensors are {describe_invalid(volume, bad)}; written unchanged, see --repair")
     with progress.stage("writing", str(args.output)):
         save_tensors(args.output, volume, provenance={"command": sys.argv, "repair": dict(volume.repair) or None})
-    return Done([args.output], {**describe_input(volume), "not_positive_definite": invalid})
+    return Done([args.output], {**describe_input(volume), "not_positive_definite": int(bad.sum())})

@@ -26,8 +26,9 @@ from hks_jax.cli.options import FORMATS, refuse
 from hks_jax.cli.outputs import Done, writing
 from hks_jax.cli.progress import Progress
 from hks_jax.fem.boundary import unreached_sides
-from hks_jax.io import read_tensors, save, save_tensors
+from hks_jax.io import find_invalid, read_tensors, save, save_tensors
 from hks_jax.io.formats import format_of
+from hks_jax.io.repair import describe_invalid
 from hks_jax.io.result import Result, plain, tuples
 from hks_jax.io.volume import TensorVolume, digest, require_position
 
@@ -154,6 +155,12 @@ def _initial(args: argparse.Namespace, target: TensorVolume, grid: Grid, progres
         raise ValueError(
             f"--init: got no tensors at {lacking} of the target's {int(grid.inside.sum())} nodes; expected tensors at "
             "all nodes of the target. Restrict the target to the mask of --init"
+        )
+    volume = volume.with_mask(grid.mask)
+    if (bad := find_invalid(volume)).any():
+        raise ValueError(
+            f"--init: {int(bad.sum())} of {int(grid.inside.sum())} tensors are {describe_invalid(volume, bad)}. Write "
+            f"repaired tensors by 'hks-jax convert {args.init} repaired.npz --repair nearest', and pass that file"
         )
     metric: Any = args.metric or "tensor"
     tensors = volume.tensors.astype(args.dtype)

@@ -38,7 +38,7 @@ file FILE...
 --mask FILE  zeros and ones in NIfTI, MRtrix, NRRD, .npy, or in the array 'mask' of an .npz
 --background outside|inside
     without --mask, whether voxels that a program filled with equal isotropic tensors, or with tensors near zero, are
-    outside or inside the domain (default: inside, with a warning; zero tensors are always outside)
+    outside or inside the domain (default: inside, with a warning). Zero tensors are outside, except with --positive
 --erode N = 0  remove N layers of voxels from the boundary of the mask
 [numbers] meaning of the numbers: needed only if the file does not declare it. Wrong axes mirror the tensors.
 --order ORDER  order of the components
