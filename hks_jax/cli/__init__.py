@@ -25,6 +25,7 @@ import numpy as np
 from hks_jax import __version__
 from hks_jax.cache import keep_compiled
 from hks_jax.cli import convert, curvature, demo, explore, fit, hks, info, paper, plot, spectrum, stats
+from hks_jax.cli.inputs import require_inputs_kept
 from hks_jax.cli.options import SPELLED, add_command, as_options
 from hks_jax.cli.outputs import show
 from hks_jax.cli.progress import Progress
@@ -62,8 +63,9 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code: 0 success, 1 failed computation, 2 bad input, 130 interrupt.
 
-    Output files are written atomically and together at the end, so a failed command writes no file, except for the
-    files of `paper` and `batch`, the checkpoint of `fit` and the eigenpairs of `hks`.
+    Results are written atomically and together at the end, so a failed command writes no file, except for the files of
+    `paper` and `batch`, the checkpoint of `fit` and the eigenpairs of `hks`. Pictures are drawn after the results are
+    written. No command replaces its input.
     """
     argv, parser = sys.argv[1:] if argv is None else argv, build_parser()
     if not argv:
@@ -81,6 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             jax.config.update("jax_enable_compilation_cache", False)
         else:
             keep_compiled()
+        require_inputs_kept(args)
         with progress.catching_warnings():
             done = args.run(args, progress)
         if done is not None:

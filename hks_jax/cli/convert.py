@@ -12,6 +12,7 @@ examples:
 
 import argparse
 import sys
+from pathlib import Path
 
 from hks_jax.cli.computation import describe_input
 from hks_jax.cli.options import READING
@@ -28,14 +29,17 @@ output OUT  the file to write; an existing file is replaced
 """
 
 
+def writes(args: argparse.Namespace) -> list[Path]:
+    """Return the files that the command may write."""
+    return [args.output]
+
+
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
     if not args.output.name.lower().endswith(WRITTEN):
         raise ValueError(f"OUT: got {args.output}; expected a name that ends in {', '.join(WRITTEN)}")
     if args.output.is_dir():
         raise IsADirectoryError(f"OUT: got the folder {args.output}; expected a file")
-    if args.output.exists() and args.output.samefile(args.file):
-        raise ValueError(f"OUT: got {args.output}, the same file as FILE. Choose another name")
     volume = read(args, progress)
     if (bad := find_invalid(volume)).any():
         progress.warn(f"{int(bad.sum())} tensors are {describe_invalid(volume, bad)}; written unchanged, see --repair")

@@ -285,5 +285,5 @@ def add_command(subparsers: Any, command: ModuleType) -> argparse.ArgumentParser
     # A word that begins with a minus and a digit is a point, such as -20,35, and not an option.
     parser._negative_number_matcher = re.compile(r"-[\d.]")
     add_options(parser, f"{command.OPTIONS}\n@common")
-    parser.set_defaults(run=command.run, prog=parser.prog, **getattr(command, "DEFAULTS", {}))
+    parser.set_defaults(run=command.run, command=command, prog=parser.prog, **getattr(command, "DEFAULTS", {}))
     return parser
