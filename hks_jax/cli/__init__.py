@@ -32,7 +32,10 @@ from hks_jax.cli.progress import Progress
 from hks_jax.cli.study import batch
 
 COMMANDS = (hks, spectrum, curvature, fit, batch, stats, plot, explore, info, convert, demo, paper)
-"""A module for each command: its docstring is the help text, `OPTIONS` lists its options, and `run` runs it."""
+"""A module for each command: its docstring is the help text, `OPTIONS` lists its options, and `run` runs it.
+
+The function `writes` of commands with input files returns the files that the command may write.
+"""
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 

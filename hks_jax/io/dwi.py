@@ -29,7 +29,7 @@ _UNKNOWNS = 7
 _DETERMINED = 0.05
 """The least singular value of the design matrix, with b-values relative to the largest, for which unknowns count as
 determined. At this value, noise of 1 % in the signals changes the tensor by 0.2 divided by the largest b-value."""
-_UNWEIGHTED = 0.01
+_UNWEIGHTED = 0.02
 """The b-value, relative to the largest, up to which an image needs no direction: it then counts as unweighted."""
 _TENSOR_MODEL = 1500.0
 """The b-value, in s/mm², up to which a tensor describes the signal of living tissue."""
@@ -91,7 +91,7 @@ def fit_dwi(
         path: a NIfTI image (nx, ny, nz, n).
         bval: a text file of the n b-values, in s/mm² unless `unit` is given.
         bvec: a text file of the n gradient directions, 3 × n or n × 3. Directions must have length 1, except for images
-            with at most 1 % of the largest b-value, which count as unweighted if their direction has another length.
+            with at most 2 % of the largest b-value, which count as unweighted if their direction has another length.
         mask: a file (see `read_mask`) or a bool array (nx, ny, nz). Tensors outside the mask are zero. If `mask` is
             None, DIPY's median_otsu finds the brain in the mean of the images with b ≤ 50, or with the lowest b-value.
         b_max: the largest b-value used, in s/mm², or None for all. The tensor model is valid for b ≲ 1000–1500 s/mm².
@@ -348,7 +348,11 @@ def _directed(
         )
     notes = []
     if (vague := ~directed & (b > 0)).any():
-        notes.append(f"{int(vague.sum())} images without a direction, b ≤ {b[vague].max():g}, count as unweighted")
+        share = b[vague].max() / b.max()
+        notes.append(
+            f"{int(vague.sum())} images without a direction, b ≤ {b[vague].max():g}, count as unweighted, which changes "
+            f"diffusivities by up to {share:.1%}"
+        )
     rounded = directed & (b > 0) & (np.abs(lengths - 1) > 1e-3)
     if rounded.any():
         low, high = lengths[rounded].min(), lengths[rounded].max()
