@@ -348,10 +348,10 @@ def _directed(
         )
     notes = []
     if (vague := ~directed & (b > 0)).any():
-        share = b[vague].max() / b.max()
+        limit = b[vague].max()
         notes.append(
-            f"{int(vague.sum())} images without a direction, b ≤ {b[vague].max():g}, count as unweighted, which changes "
-            f"diffusivities by up to {share:.1%}"
+            f"{int(vague.sum())} images without a direction, b ≤ {limit:g}, count as unweighted, which changes "
+            f"diffusivities by up to {limit / b.max():.1%}"
         )
     rounded = directed & (b > 0) & (np.abs(lengths - 1) > 1e-3)
     if rounded.any():
