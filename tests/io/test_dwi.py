@@ -319,6 +319,28 @@ def test_covariances_agree_with_the_wild_bootstrap(scan, rng):
     assert abs(np.mean(ratios) - 1) < 0.1
 
 
+def test_each_voxel_is_fitted_to_what_was_measured_there(scan, rng):
+    """Against NumPy's least squares, voxel by voxel, with signals of which a tenth are zero or negative."""
+    noisy_scan(scan, 16, rng, sigma=40.0)
+    scan.signal[rng.random(scan.signal.shape) < 0.1] = 0
+    scan.signal[rng.random(scan.signal.shape) < 0.02] *= -1
+    fit = scan.fit(head(), bvec_frame="voxel")
+    g, (rows, columns) = scan.directions, np.tril_indices(3)
+    X = np.column_stack([-scan.b[:, None] * g[:, rows] * g[:, columns] * np.where(rows == columns, 1, 2), np.ones(16)])
+    for voxel in map(tuple, np.argwhere(fit.mask)[::20]):
+        there = scan.signal[voxel] > 0
+        A, y = X[there], np.log(scan.signal[voxel][there])
+        w = np.exp(A @ np.linalg.lstsq(A, y)[0])
+        expected = np.linalg.lstsq(A * w[:, None], w * y)[0][:6]
+        np.testing.assert_allclose(lower(fit.tensors[voxel]), expected, rtol=1e-7, atol=1e-10)
+
+
+def test_negative_b_values_are_refused(scan):
+    scan.b[3] = -1000.0
+    with pytest.raises(ValueError, match=r"[/\\]b: got the b-value -1000; expected numbers from 0"):
+        scan.fit(head())
+
+
 @pytest.mark.slow
 def test_the_error_of_anisotropy_is_that_of_koay(scan, rng):
     noisy_scan(scan, 30, rng)
