@@ -1,9 +1,9 @@
 # %% [markdown]
 # # A brain, from the scan to its signature
 #
-# This notebook starts from diffusion-weighted images with b-values and directions. DIPY fits the tensors. Then follow
-# the mask, a slice, the metric, the eigenpairs, the heat kernel signature at several times, pictures, and a NIfTI
-# file in the space of the scan. To use your own scan, run
+# This notebook starts from diffusion-weighted images with b-values and directions, and fits tensors. Then follow the
+# mask, a slice, the metric, the eigenpairs, the heat kernel signature at several times, pictures, and a NIfTI file in
+# the space of the scan. To use your own scan, run
 #
 #     HKS_SCAN=dwi.nii.gz HKS_SLICE=10 python notebooks/brain.py
 #
@@ -60,8 +60,8 @@ bval, bvec = (scan.with_name(stem + suffix) for suffix in (".bval", ".bvec"))
 #
 # Without a mask, DIPY's `median_otsu` finds the brain. A slice uses the in-plane block of D, so diffusion stays in
 # the slice. The rim is removed, because its voxels contain tissue and its surroundings. Noise makes some tensors
-# indefinite. DIPY clips their eigenvalues to almost zero, and D⁻¹ would be extremely large. These tensors are
-# replaced by the nearest valid tensors.
+# indefinite or nearly singular, and D⁻¹ would not exist or be extremely large. These tensors are replaced by the
+# nearest valid tensors.
 
 # %%
 volume = hj.io.fit_dwi(scan, bval, bvec, b_max=1500)

@@ -32,12 +32,20 @@ result RESULT  the folder OUT that 'hks-jax hks' wrote, or an .npz from there
 """
 
 
+def writes(args: argparse.Namespace) -> list[Path]:
+    """Return the files that the command may write."""
+    return [_page(args)]
+
+
+def _page(args: argparse.Namespace) -> Path:
+    return args.output or signature_file(args.result).with_name("explore.html")
+
+
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
     from hks_jax.plot import explore
 
-    source = signature_file(args.result)
-    page = args.output or source.with_name("explore.html")
+    source, page = signature_file(args.result), _page(args)
     if page.suffix.lower() not in (".html", ".htm"):
         raise ValueError(f"--output: got {page}; expected a name that ends in .html")
     if args.labels is None:

@@ -16,6 +16,7 @@ import json
 import math
 import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,13 +24,14 @@ import numpy as np
 from hks_jax import Grid, TensorField
 from hks_jax.cli.computation import ComputationError, use_dtype
 from hks_jax.cli.options import FORMATS, refuse
-from hks_jax.cli.outputs import Done, writing
+from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import require_one
 from hks_jax.domain.tensor_field import diffusion_tensors
 from hks_jax.fem.boundary import unreached_sides
-from hks_jax.io import read_tensors, save, save_tensors
+from hks_jax.io import find_invalid, read_tensors, save, save_tensors
 from hks_jax.io.formats import format_of
+from hks_jax.io.repair import describe_invalid
 from hks_jax.io.result import Result, plain, tuples
 from hks_jax.io.volume import TensorVolume, digest, require_position
 
@@ -71,6 +73,12 @@ target TARGET  the signature, an .npz file or the folder of a signature
 _NO_METRIC = "--metric: choose inverse, tensor or adjugate, because --init has diffusion tensors and not a metric"
 _OF_SEARCH = ("optimiser", "smoothness", "max_steps", "continuation", "starts", "seed")
 """Options that are arguments of `Search` with the same name."""
+
+
+def writes(args: argparse.Namespace) -> list[Path]:
+    """Return the files that the command may write."""
+    checkpoint = [] if args.checkpoint is None else [args.checkpoint]
+    return [*(args.output / name for name in ("tensors.npz", "fit.npz", "fit.png", REPORT)), *checkpoint]
 
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
@@ -177,6 +185,12 @@ def _initial(args: argparse.Namespace, target: TensorVolume, grid: Grid, progres
             f"--init: got no tensors at {lacking} of the target's {int(grid.inside.sum())} nodes; expected tensors at "
             "all nodes of the target. Restrict the target to the mask of --init"
         )
+    volume = volume.with_mask(grid.mask)
+    if (bad := find_invalid(volume)).any():
+        raise ValueError(
+            f"--init: {int(bad.sum())} of {int(grid.inside.sum())} tensors are {describe_invalid(volume, bad)}. Write "
+            f"repaired tensors by 'hks-jax convert {args.init} repaired.npz --repair nearest', and pass that file"
+        )
     metric: Any = args.metric or (None if fick else "tensor")
     of: Any = {"operator": args.operator, "interpolation": args.interpolation, "name": "--init"}
     return TensorField.from_diffusion(grid, volume.tensors.astype(args.dtype), metric, **of)
@@ -191,12 +205,14 @@ def _write(args: argparse.Namespace, fit: Any, target: Result, report: dict[str,
     volume = replace(volume, source=target.source, digest=digest(target.source), notes=(), unit="")
     history = {"losses": "loss", "misfits": "misfit", "stages": "stage", "starts": "start"}
     columns = {name: np.array([getattr(step, of) for step in fit.history]) for name, of in history.items()}
-    with writing(args.output, report, progress, lambda: [args.output / "fit.png"]) as (folder, done):
+
+    def draw(path: Path) -> None:
+        save_figure(fit_panels(fit, target.values, target.times, orientation=placed(volume, None, args.view)), path)
+
+    pictures = {"fit.png": draw} if volume.dimension == 2 else {}
+    with writing(args.output, report, progress, lambda: [args.output / "fit.png"], pictures) as (folder, done):
         origin, extra = {"command": sys.argv, "settings": report["settings"]}, {"times": target.times, **columns}
         metric = replace(volume, length_unit="")  # otherwise, the tensors count as diffusion tensors when they are read
         save_tensors(folder / "tensors.npz", metric, provenance=origin)
         save(folder / "fit.npz", np.asarray(fit.hks), volume, name="hks", extra=extra, provenance=origin)
-        if volume.dimension == 2:
-            figure = fit_panels(fit, target.values, target.times, orientation=placed(volume, None, args.view))
-            save_figure(figure, folder / "fit.png")
     return done

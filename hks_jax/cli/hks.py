@@ -36,7 +36,7 @@ from hks_jax.cli.computation import Settings, compute_pairs, result_of, solve, u
 from hks_jax.cli.info import describe_mesh
 from hks_jax.cli.noise import Noisy, check_noise, noise_of_volume, signature_of, with_error_bars
 from hks_jax.cli.options import READING, SOLVING, options_in, refuse
-from hks_jax.cli.outputs import PAIRS, Done, of_earlier, write_outputs
+from hks_jax.cli.outputs import PAIRS, REPORT, Done, of_earlier, write_outputs
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read, read_volume, require_metric, require_one
 from hks_jax.fem.assembly import MESH_BOUNDARIES
@@ -68,6 +68,11 @@ OPTIONS = f"""
 _OF_TENSORS = ("metric", "operator", "order", "interpolation")
 """Options that refer to tensors at the vertices of a mesh."""
 _NO_NOISE = "this option needs tensors; saved eigenpairs and meshes with the Euclidean metric have none. Leave it out"
+
+
+def writes(args: argparse.Namespace) -> list[Path]:
+    """Return the files that the command may write."""
+    return [args.output / name for name in ("hks.*", REPORT, *[PAIRS] * args.save_pairs)]
 
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:

@@ -32,6 +32,7 @@ from hks_jax.domain.tensor_checks import MANY, unsymmetric
 from hks_jax.fem.boundary import BoundarySpec, default_boundary
 from hks_jax.io import TensorVolume, find_invalid, read_mesh
 from hks_jax.io.mesh import is_mesh
+from hks_jax.io.repair import least_admissible
 from hks_jax.io.result import NAMES, Result, signature_file
 from hks_jax.io.units import MM2_PER_S, by_axis, is_plausible
 from hks_jax.io.volume import digest
@@ -82,6 +83,7 @@ def _describe_result(result: Result) -> dict[str, Any]:
 def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = None) -> dict[str, Any]:
     """Return facts about a volume for JSON. If `boundary` is None, `default_boundary` determines suitable k and t."""
     inside, bad = volume.inside, find_invalid(volume)
+    not_positive = int(find_invalid(volume, 0.0).sum())
     boundary = default_boundary(inside)[0] if boundary is None else boundary
     good = inside & ~bad
     labels, count = label_nodes(inside, (False,) * volume.dimension)
@@ -99,7 +101,9 @@ def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = N
         "without_element": int((inside & (labels == 0)).sum()),
         "boundary": boundary,
         "component_sizes": np.sort(np.bincount(labels.ravel())[1:])[::-1][:10].tolist(),
-        "not_positive_definite": int(bad.sum()),
+        "not_positive_definite": not_positive,
+        "nearly_singular": int(bad.sum()) - not_positive,
+        "least_admissible_eigenvalue": least_admissible(volume),
         "not_symmetric": int((inside & unsymmetric(volume.tensors)).sum()),
     }
     wrong = volume.invalid_by_order
@@ -154,6 +158,7 @@ def _lines(description: dict[str, Any]) -> list[str]:
         lines += [f"{name:<18}{_plain(value)}" for name, value in facts.items()]
     else:
         bad, sizes = description["not_positive_definite"], ", ".join(map(str, description["component_sizes"]))
+        singular, least = description["nearly_singular"], description["least_admissible_eigenvalue"]
         length = f" {description['length_unit']}" if description["length_unit"] else ", without a declared unit"
         placed = "without an affine" if description["affine"] is None else "with an affine"
         lines += [
@@ -180,6 +185,13 @@ def _lines(description: dict[str, Any]) -> list[str]:
             )
         elif bad:
             lines[-1] += ": see --repair"
+        if singular:
+            lines.append(
+                f"                {singular} tensors are nearly singular, with an eigenvalue below {least:.3g}, a "
+                "hundredth of the median mean diffusivity, which no tissue has: see --repair"
+            )
+        if bad or singular:
+            lines.append("                k and t below are those of the other tensors")
         if description["not_symmetric"]:
             lines.append(f"                {description['not_symmetric']} tensors are not symmetric")
     in_mm, unit = description.get("length_unit") == "mm", description.get("unit", "")

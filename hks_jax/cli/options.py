@@ -42,7 +42,7 @@ file FILE...
 --mask FILE  zeros and ones in NIfTI, MRtrix, NRRD, .npy, or in the array 'mask' of an .npz
 --background outside|inside
     without --mask, whether voxels that a program filled with equal isotropic tensors, or with tensors near zero, are
-    outside or inside the domain (default: inside, with a warning; zero tensors are always outside)
+    outside or inside the domain (default: inside, with a warning). Zero tensors are outside, except with --positive
 --erode N = 0  remove N layers of voxels from the boundary of the mask
 [numbers] meaning of the numbers: needed only if the file does not declare it. Wrong axes mirror the tensors.
 --order ORDER  order of the components
@@ -63,14 +63,16 @@ file FILE...
 --positive HOW:NUMBER
     map for tensors T that are naturally indefinite, such as stress: exp:S uses exp(T/S) and shift:C uses T + C·I as the
     metric; combine it with --metric tensor
-[dwi] diffusion-weighted images: DIPY fits the tensors. Without --mask, DIPY's median_otsu finds the brain.
+[dwi] diffusion-weighted images: a fit gives the tensors. Without --mask, DIPY's median_otsu finds the brain.
 --bval FILE  b-values, in s/mm2 unless --unit is given
 --bvec FILE
     gradient directions of length 1 in three rows or three columns, as dcm2niix writes them (see --bvec-frame)
 --bvec-frame fsl|voxel|world
     axes of the directions: the voxel axes, the first reversed if the affine's determinant is positive (fsl, the
     default, for FSL, dcm2niix and BIDS), the voxel axes (voxel), or the scanner's axes (world, for MRtrix)
---b-max B  largest b-value used, in s/mm2; the tensor model holds for b ≲ 1500
+--b-max B
+    largest b-value used, in s/mm2 (default: all are used, with a warning above 1500, up to which the tensor model
+    holds)
 [domain]
 --components raise|largest|all = raise
     if the mask is not connected: raise an error (default), keep the largest component, or keep all components
@@ -288,5 +290,5 @@ def add_command(subparsers: Any, command: ModuleType) -> argparse.ArgumentParser
     # A word that begins with a minus and a digit is a point, such as -20,35, and not an option.
     parser._negative_number_matcher = re.compile(r"-[\d.]")
     add_options(parser, f"{command.OPTIONS}\n@common")
-    parser.set_defaults(run=command.run, prog=parser.prog, **getattr(command, "DEFAULTS", {}))
+    parser.set_defaults(run=command.run, command=command, prog=parser.prog, **getattr(command, "DEFAULTS", {}))
     return parser

@@ -10,6 +10,7 @@ examples:
 
 import argparse
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,11 @@ result RESULT  the result, as an .npz or the folder of a signature
 
 MANY = 12
 """The largest number of images, unless times are chosen."""
+
+
+def writes(args: argparse.Namespace) -> list[Path]:
+    """Return the files that the command may write."""
+    return [args.output]
 
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:

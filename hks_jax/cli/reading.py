@@ -62,27 +62,19 @@ def read(args: argparse.Namespace, progress: Progress, ask: Callable[[str], None
         if mask is not None and mask.shape == volume.shape:
             volume, mask = volume.with_mask(mask), None
         if mask is None:  # the background would distort the checks of units and frames
-            volume = _without_filling(without_background(volume), args.background, progress)
+            volume = _without_filling(volume, args, progress)
         volume = _reviewed(volume, args, progress.warn if ask is None else ask)
         if args.slice is not None:
             volume = sliced(volume, *args.slice)
         if mask is not None:  # the mask may have the shape of the slice
             if mask.shape != volume.shape:
                 raise ValueError(f"--mask: got shape {mask.shape}; expected the shape of the tensors, {volume.shape}")
-            volume = without_background(volume.with_mask(mask))
+            volume = volume.with_mask(mask)
         if args.erode:
             volume = volume.with_mask(erode(volume.inside, args.erode))
         volume = _repaired(volume, args)
     for note in volume.notes:
         progress.note(as_options(note))
-    if args.bval is not None:
-        values = np.linalg.eigvalsh(volume.tensors[volume.inside])
-        if clipped := int((values[:, 0] < 0.01 * np.median(values.mean(axis=-1))).sum()):
-            progress.warn(
-                f"{clipped} tensors in the mask have an eigenvalue near zero, because DIPY clips fits that are not "
-                "positive definite. At such voxels, distances in the metric D⁻¹ are very large. --erode 1 removes "
-                "boundary voxels, and --repair nearest:1e-4 replaces the tensors"
-            )
     return volume
 
 
@@ -115,12 +107,17 @@ def _load(args: argparse.Namespace) -> tuple[TensorVolume, np.ndarray | None]:
     return fit_dwi(*files, args.b_max, unit=args.unit, noise=noise, **axes), None
 
 
-def _without_filling(volume: TensorVolume, background: str | None, progress: Progress) -> TensorVolume:
-    """Exclude the background if ``--background outside`` is given; without the option, warn of a background."""
-    found = None if background == "inside" else find_background(volume)
+def _without_filling(volume: TensorVolume, args: argparse.Namespace, progress: Progress) -> TensorVolume:
+    """Exclude the background if ``--background outside`` is given; without the option, warn of a background.
+
+    Zero tensors are always background, except with ``--positive``: zero is a valid stress.
+    """
+    if args.positive is None or args.background == "outside":
+        volume = without_background(volume)
+    found = None if args.background == "inside" else find_background(volume)
     if found is None:
         return volume
-    if background is None:
+    if args.background is None:
         progress.warn(f"{found[1]}. Pass --mask or --background outside, or --background inside to include them")
         return volume
     note = found[1].replace("count as inside", "are left out, as asked")

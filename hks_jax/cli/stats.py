@@ -43,10 +43,19 @@ _SCALES = {
 }
 
 
+def writes(args: argparse.Namespace) -> list[Path]:
+    """Return the files that the command may write."""
+    table = _table(args)
+    return [table, table.with_suffix(".json")]
+
+
+def _table(args: argparse.Namespace) -> Path:
+    return args.output or signature_file(args.result).with_name("regions.tsv")
+
+
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
-    source = signature_file(args.result)
-    table = args.output or source.with_name("regions.tsv")
+    source, table = signature_file(args.result), _table(args)
     if table.suffix.lower() != ".tsv":
         raise ValueError(f"--output: got {table}; expected a name that ends in .tsv")
     with progress.stage("regions", f"{args.atlas} on {source}"):

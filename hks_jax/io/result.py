@@ -206,9 +206,14 @@ class Result:
 
     @property
     def smallest_time(self) -> float:
-        """The time below which more than 1 % of the signature lies beyond its eigenpairs; 0 if this is not known."""
-        spectral = self.eigenvalues.size and self.settings.get("method", "spectral") == "spectral"
-        return RESOLVED[self.dimension] / float(self.eigenvalues[-1]) if spectral else 0.0
+        """The time below which more than 1 % of the signature lies beyond its eigenpairs; 0 if this is not known.
+
+        It is infinite if no eigenvalue is positive.
+        """
+        if not self.eigenvalues.size or self.settings.get("method", "spectral") != "spectral":
+            return 0.0
+        last = float(self.eigenvalues[-1])
+        return RESOLVED[self.dimension] / last if last > 0 else math.inf
 
     @property
     def flat_scale(self) -> Float[np.ndarray, "n_times ..."]:

@@ -26,6 +26,7 @@ from hks_jax.cli.progress import StudyProgress
 from hks_jax.cli.study.batch import common_times, suitable_range
 from hks_jax.cli.study.folder import Study
 from hks_jax.cli.study.subjects import read_subjects
+from hks_jax.cli.study.tasks import Outcome
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
 from hks_jax.io.masks import names_beside, read_names
 from hks_jax.io.nifti import component_of
@@ -454,7 +455,7 @@ def test_automatic_times_follow_the_metric_and_remain_those_of_the_study(study, 
         assert main([*command(study, "out", "--times", "auto:2", *more), "-q"]) == 0
         return json.loads((study / "out" / "study.json").read_text())["times"]
 
-    monkeypatch.setattr("hks_jax.cli.study.tasks.run_all", lambda *_: {})
+    monkeypatch.setattr("hks_jax.cli.study.tasks.run_all", lambda *_: Outcome({}, []))
     monkeypatch.setattr(Study, "write_group", lambda *_: [])
     save_tensors(study / "t3.nii.gz", volume(0.9))
     first = times()
@@ -621,7 +622,7 @@ def test_a_study_keeps_the_boundary_that_it_began_with(study, monkeypatch, capsy
         assert main(command(study, out, "--times", "3e3", *more)) == 0
         return json.loads((study / out / "study.json").read_text())["settings"]["boundary"]
 
-    monkeypatch.setattr("hks_jax.cli.study.tasks.run_all", lambda *_: {})
+    monkeypatch.setattr("hks_jax.cli.study.tasks.run_all", lambda *_: Outcome({}, []))
     monkeypatch.setattr(Study, "write_group", lambda *_: [])
     assert boundary("new") == "mean"
     assert "options for all subjects: --boundary mean\n" in capsys.readouterr().err
@@ -633,7 +634,7 @@ def test_a_study_keeps_the_boundary_that_it_began_with(study, monkeypatch, capsy
 
 
 def test_omitted_options_are_those_of_the_study(study, monkeypatch, capsys):
-    monkeypatch.setattr("hks_jax.cli.study.tasks.run_all", lambda *_: {})
+    monkeypatch.setattr("hks_jax.cli.study.tasks.run_all", lambda *_: Outcome({}, []))
     monkeypatch.setattr(Study, "write_group", lambda *_: [])
     kept = ["--normalisation", "flat", "--repair", "clip:1e-4", "--times", "3e3", "6e3", "--time-unit", "lambda1"]
     assert main(command(study, "out", "--erode", "0", *kept)) == 0

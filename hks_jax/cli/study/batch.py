@@ -35,19 +35,21 @@ import math
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hks_jax.cli.computation import ComputationError, Settings
 from hks_jax.cli.info import describe
+from hks_jax.cli.inputs import require_inputs_kept
 from hks_jax.cli.noise import check_noise, second_scan
 from hks_jax.cli.options import FILES, READING, SOLVING, defaults, flag, options_in, refuse
 from hks_jax.cli.outputs import Done, show
 from hks_jax.cli.parsing import Times
 from hks_jax.cli.progress import Progress, StudyProgress
 from hks_jax.cli.reading import read_volume, require_metric
-from hks_jax.cli.study.folder import MAP, Study, reading_options
+from hks_jax.cli.study.folder import DESCRIPTIONS, MAP, PAIRS, REGIONS, Study, reading_options
 from hks_jax.cli.study.subjects import Subject, read_subjects
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import tuples
@@ -77,6 +79,11 @@ subjects SUBJECTS  the table of subjects
 """
 
 
+def writes(args: argparse.Namespace) -> list[Path]:
+    """Return the files that the command may write."""
+    return [args.output / name for name in (*DESCRIPTIONS, "group_*", f"**/*{MAP}*", f"**/*{REGIONS}*", f"**/*{PAIRS}")]
+
+
 def run(args: argparse.Namespace, begun: Progress) -> None:
     """Run the command; if some subjects fail, raise ComputationError after computing the others."""
     from hks_jax.cli.study.tasks import run_all
@@ -90,6 +97,7 @@ def run(args: argparse.Namespace, begun: Progress) -> None:
     chosen = _only(subjects, args.only)
     for subject in chosen:
         if subject.arguments is not None:
+            require_inputs_kept(subject.arguments)
             require_metric(subject.arguments)
             check_noise(subject.arguments)
     if not any(s.arguments is not None and s.arguments.atlas is not None for s in subjects):
@@ -100,7 +108,8 @@ def run(args: argparse.Namespace, begun: Progress) -> None:
     with progress.catching_warnings():
         study = _open(args, subjects, progress)
         problems = {subject.name: "" for subject in subjects if subject not in chosen}
-        problems |= run_all(study, chosen, progress, args.debug)
+        outcome = run_all(study, chosen, progress, args.debug)
+        problems |= outcome.problems
         if args.only:  # other processes may have finished other subjects
             there = {s.name for s in subjects if problems.get(s.name) == "" and _is_there(study, s)}
             problems = {name: why for name, why in problems.items() if name not in there}
@@ -114,6 +123,11 @@ def run(args: argparse.Namespace, begun: Progress) -> None:
             f"{len(failed)} of {len(chosen)} subjects failed ({', '.join(failed[:5])}{', …' * (len(failed) > 5)}); "
             f"{args.output / 'group_summary.tsv'} contains the reasons. The other subjects are done. Repeat the "
             "command to compute the failed subjects again"
+        )
+    if outcome.undrawn:
+        raise ComputationError(
+            f"the results are complete, but {len(outcome.undrawn)} of {len(chosen)} pictures cannot be drawn "
+            f"({', '.join(outcome.undrawn[:5])}{', …' * (len(outcome.undrawn) > 5)}). Repeat the command to draw them"
         )
 
 
@@ -147,6 +161,10 @@ def _complete(args: argparse.Namespace) -> str:
         kept.pop("metric", None)
     elif args.metric is not None:
         kept.pop("operator", None)
+    for name, path in before.get("files", {}).items():
+        if getattr(args, name, "") is None:
+            setattr(args, name, Path(path))
+            taken.append(f"{flag(name)} {path}")
     # Comparable subjects need the same boundary condition, with or without a mask.
     usual = {**vars(defaults(KEPT)), "boundary": "mean"}
     for name in DEFAULTS:
@@ -179,7 +197,14 @@ def _spelled(name: str, value: Any) -> str:
 
 def _open(args: argparse.Namespace, subjects: list[Subject], progress: StudyProgress) -> Study:
     """Return the study with explicit times and write its description; raise ValueError if there is another study."""
-    study = Study(args.output, Settings.of(args), args.time_unit, reading_options(args), args.save_pairs)
+    there = [name for name in DESCRIPTIONS if (args.output / name).exists()]
+    if there and "study.json" not in there:
+        raise ValueError(
+            f"--output: got {args.output}, where another program wrote {', '.join(there)}; expected a new folder or a "
+            f"study. Choose a folder such as {args.output / 'derivatives' / 'hks-jax'}"
+        )
+    files = {name: str(getattr(args, name).absolute()) for name in FILES if getattr(args, name) is not None}
+    study = Study(args.output, Settings.of(args), args.time_unit, reading_options(args), args.save_pairs, files)
     times = study.settings.times
     before, chosen = read_json(args.output / "study.json"), "explicit" if times.explicit else f"auto:{times.automatic}"
     now, then = _options({**study.record, "chosen": chosen}), _options(before)
