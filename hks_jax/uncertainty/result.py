@@ -94,7 +94,7 @@ class Uncertainty(eqx.Module):
         larger than `bias_error` and the noise acts linearly. It is half of the bias if `beyond_linear` is 5 % in the
         median over the map, less if `beyond_linear` is larger, and never more than the standard deviation. On maps of
         grids and of a sphere with 1 to 20 % noise, the root mean square error of the corrected value was at most 3 %
-        larger than the error of the value, and up to 30 % smaller.
+        larger than the error of the value, and up to a third smaller.
         """
         return jax.tree.map(jnp.subtract, self.value, self._correction)
 

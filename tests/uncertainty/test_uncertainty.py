@@ -253,7 +253,7 @@ def test_noise_alone_is_beyond_two_as_often_as_a_normal_number(field, level, num
 @pytest.mark.parametrize(
     ("field", "level", "worst", "best"),
     [
-        (sphere(), 0.05, 1.04, 1.01),
+        (sphere(), 0.2, 1.04, 0.99),  # with the whole bias, the ratio is 1.4
         (square(), 0.05, 1.02, 0.95),
         *(
             pytest.param(field, level, 1.04, 1.01, marks=pytest.mark.slow)
@@ -265,12 +265,11 @@ def test_noise_alone_is_beyond_two_as_often_as_a_normal_number(field, level, num
 def test_corrected_values_are_not_worse_and_intervals_contain_the_truth(field, level, worst, best):
     def of(bars, truth):
         (a, b), (c, d) = bars.interval(0.68), bars.interval(0.95)
-        errors = ((each - truth) ** 2 for each in (bars.value, bars.corrected, bars.value - bars.bias))
+        errors = ((each - truth) ** 2 for each in (bars.value, bars.corrected))
         return [*errors, (a < truth) & (truth < b), (c < truth) & (truth < d)]
 
-    value, corrected, wholly, in_68, in_95 = measured_often(*field, level, 24, of)
+    value, corrected, in_68, in_95 = measured_often(*field, level, 24, of)
     ratio = np.sqrt(corrected / value)
-    print(level, ratio, np.sqrt(wholly / value), in_68, in_95)
     assert ratio.max() < worst
     assert ratio.min() < best
     assert (in_68 > 0.62).all()
