@@ -99,8 +99,29 @@ def with_error_bars(
         "claimed": np.asarray(bars.trusted).tolist(),
         f"exceeds_{_CLEAR:g}_from_t": float(times[clear[0]]) if clear.size else None,
     }
-    arrays = {"deviation": np.asarray(bars.deviation), "bias": np.asarray(bars.bias), "noise_maps": maps}
+    for line in _told(ratio, times, result.unit):
+        progress.note(line)
+    # With a normalisation by the whole domain, the level of a map depends on the domain's volume, which differs from
+    # that of constant tensors. Then only differences between nodes are compared.
+    by_domain = settings.normalisation in ("heat-trace", "volume")
+    axes = tuple(range(1, bars.value.ndim))
+    level = jnp.nanmedian(bars.value - bars.null, axis=axes, keepdims=True) if by_domain else 0.0
+    z = bars.z(bars.null + level)
+    arrays = {"deviation": bars.deviation, "bias": bars.bias, "z": z, "noise_maps": maps}
+    arrays = {name: np.asarray(array) for name, array in arrays.items()}
     return replace(result, arrays=arrays, report={**result.report, "noise": report})
+
+
+def _told(ratio: np.ndarray, times: tuple[float, ...], unit: str) -> list[str]:
+    """Return lines with the signal-to-noise ratio at each t, and with the times at which there is no signal."""
+    at = [f"t = {t:.4g} {unit}".rstrip() for t in times]
+    known = [f"{r:.2g} at {where}" for r, where in zip(ratio, at, strict=True) if np.isfinite(r)]
+    lines = [f"signal-to-noise ratio: {', '.join(known)}"] if known else []
+    if none := [where for r, where in zip(ratio, at, strict=True) if r == 0]:
+        lines.append(f"noise explains all differences from constant tensors at {', '.join(none)}")
+    if unknown := [where for r, where in zip(ratio, at, strict=True) if not np.isfinite(r)]:
+        lines.append(f"no signal-to-noise ratio at {', '.join(unknown)}: the boundary influences nearly all nodes")
+    return lines
 
 
 def noise_of_volume(

@@ -106,7 +106,7 @@ file FILE...
 --noise NOISE
     noise of the tensors, for error bars: a number relative to the mean diffusivity, such as 0.1; residuals, for the
     residuals of the fit to diffusion-weighted images; a second FILE of tensors, from another scan of the subject; or
-    roughness, for differences of neighbouring voxels. The option adds deviation and bias to the .npz, the
+    roughness, for differences of neighbouring voxels. The option adds deviation, bias and z to the .npz, the
     signal-to-noise ratio at each t to the report, the column error to tables of regions, and fades parts of the picture
     that noise may explain. Automatic times of a single subject begin at a sufficient signal-to-noise ratio
 --draws N = 8  number of noisy maps from which error bars are computed

@@ -35,9 +35,9 @@ class Result:
         times: (n_times,), or (0,) for a result without times.
         eigenvalues: (k,), or (0,) if they are unknown.
         report: facts about the computation; the entry ``settings`` contains its settings.
-        arrays: more named arrays, saved with the result: ``deviation``, ``bias`` and ``noise_maps`` (n_draws, n_times,
-            *shape) for error bars, ``scaled_times`` (t times the first positive eigenvalue), ``density`` (√|D| of the
-            diffusivity D, for Fick's operator), and ``input_tensors``.
+        arrays: more named arrays, saved with the result: ``deviation``, ``bias``, ``z`` and ``noise_maps`` (n_draws,
+            n_times, *shape) for error bars, ``scaled_times`` (t times the first positive eigenvalue), ``density``
+            (√|D| of the diffusivity D, for Fick's operator), and ``input_tensors``.
         name: ``"hks"`` or ``"curvature"``.
         source: the file from which the result was read.
 
@@ -125,7 +125,7 @@ class Result:
             # Only a mesh with a mask may have vertices that belong to no cell, which are outside the domain.
             place = kind(arrays["vertices"], cells, mask=np.ones(cells.shape[:1], bool))
         eigenvalues, report = arrays.get("eigenvalues", np.zeros(0)), {"settings": record.get("settings") or {}}
-        known = ("deviation", "bias", "noise_maps", "scaled_times", "density", "input_tensors")
+        known = ("deviation", "bias", "z", "noise_maps", "scaled_times", "density", "input_tensors")
         more = {n: a for n, a in arrays.items() if n in known}
         return cls(place, values, times, eigenvalues, report, more, name, str(path))
 
@@ -196,13 +196,8 @@ class Result:
 
     @property
     def z(self) -> Float[np.ndarray, "n_times *shape"] | None:
-        """The values minus their flat-space value or their median, in standard deviations of the noise, if known."""
-        if "deviation" not in self.arrays:
-            return None
-        # Normalisations except "raw" and "flat" have no known value in flat space, so the median at each time is used.
-        flat = {"raw": 1 / self.to_flat, "flat": 1.0}
-        median = np.nanmedian(self.values, axis=tuple(range(1, self.values.ndim)), keepdims=True)
-        return (self.values - flat.get(self.normalisation, median)) / self.arrays["deviation"]
+        """The distance of the values from those of constant tensors (`hks_jax.Uncertainty.z`), if known."""
+        return self.arrays.get("z")
 
     @property
     def smallest_time(self) -> float:

@@ -1,5 +1,6 @@
 """Images of scalars on grids."""
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -16,7 +17,14 @@ from hks_jax.plot.figure import cell_extent, colour_bar, frame, require_plane
 from hks_jax.plot.orientation import Orientation
 
 FADED = 2.0
-"""The number of standard deviations from the null value above which values are not faded as noise."""
+"""The distance |z| from the null value above which values are not faded as noise."""
+UNFADED = math.erfc(FADED / math.sqrt(2))
+"""The share of nodes that noise alone leaves without any grey."""
+FADED_NOTE = (
+    "grey: noise explains the difference from constant tensors;\n"
+    f"noise alone leaves {100 * UNFADED:.0f} % of the nodes without grey"
+)
+"""The legend of pictures with faded values."""
 FAR = 1.5
 """If the median of nonnegative values exceeds 1.5 times the centre, the colour range is not centred."""
 RULES = ("quantiles", "least_range", "centre", "vmin", "vmax")
@@ -59,8 +67,8 @@ def scalar_image(
         colorbar: whether to add a colour bar.
         label: the colour bar's label.
         orientation: the grid's orientation in space, by which the image is turned and its sides are labelled (L, R, …).
-        z: (*shape,) the distance of the values from a null value in standard deviations of noise
-            (`hks_jax.Uncertainty.z`). Values within two standard deviations of the null value fade to grey.
+        z: (*shape,) the distance of the values from a null value as a normal number (`hks_jax.Uncertainty.z`). Values
+            with |z| < 2 fade to grey; noise alone leaves 4.6 % of the nodes without grey.
         **kwargs: arguments of `Axes.imshow`.
 
     Raises:

@@ -13,7 +13,7 @@ from hks_jax import Grid
 from hks_jax.fem.boundary import normalise_boundary
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result, require_result
-from hks_jax.plot.images import Colours, colours_of
+from hks_jax.plot.images import FADED, FADED_NOTE, Colours, colours_of
 from hks_jax.plot.orientation import Orientation, View
 from hks_jax.plot.panels import hks_panels, panel_titles
 from hks_jax.plot.volumes import volume_panels
@@ -42,7 +42,8 @@ def signature_panels(
 
     The colour range contains nearly all values away from the boundary, and colour bars have arrows if other values
     exceed the range. With "flat" normalisation the colours diverge from 1, the value for a flat metric, unless most
-    values are far above 1. Values that noise explains fade to grey. Titles contain diffusion lengths √(Dt), if known.
+    values are far above 1. Values that noise explains fade to grey, and titles contain the share of the nodes that are
+    not grey. Titles contain diffusion lengths √(Dt), if known.
 
     Args:
         result: the signature to draw.
@@ -66,7 +67,7 @@ def signature_panels(
     colours = _colours(result, inside)
     style: dict[str, Any] = {
         "titles": titles_of(result),
-        "suptitle": title or caption(result),
+        "suptitle": "\n".join([title or caption(result), *legend(result)]),
         "limits": [each[:2] for each in colours],
         "cmap": colours[0].cmap,
         "orientation": placed(volume, box, view),
@@ -96,14 +97,22 @@ def caption(result: Result) -> str:
     return names[result.normalisation] + f", metric {metric}" * (metric is not None)
 
 
+def legend(result: Result) -> list[str]:
+    """Return the lines of a legend: the meaning of grey."""
+    return [] if result.z is None else [FADED_NOTE]
+
+
 def titles_of(result: Result) -> Sequence[str]:
-    """Return a title for each time of a signature, with the length √(Dt) if it is known."""
+    """Return a title for each time, with the length √(Dt) and the share of nodes above the noise if they are known."""
     early = [" (too few eigenpairs)" * bool(t < result.smallest_time) for t in result.times]
     titles = [title + why for title, why in zip(panel_titles(result.times, None, result.unit), early, strict=True)]
-    if result.lengths is None:
-        return titles
-    lengths = (f"{length:.3g} {result.length_unit}".rstrip() for length in result.lengths)
-    return [f"{title}\n$\\sqrt{{Dt}}$ = {length}" for title, length in zip(titles, lengths, strict=True)]
+    if result.lengths is not None:
+        lengths = (f"{length:.3g} {result.length_unit}".rstrip() for length in result.lengths)
+        titles = [f"{title}\n$\\sqrt{{Dt}}$ = {length}" for title, length in zip(titles, lengths, strict=True)]
+    if result.z is not None:
+        shares = (np.mean(np.abs(z[np.isfinite(z)]) > FADED) for z in result.z)
+        titles = [f"{title}\n{100 * share:.0f} % without grey" for title, share in zip(titles, shares, strict=True)]
+    return titles
 
 
 def _colours(result: Result, inside: Bool[np.ndarray, "*shape"]) -> list[Colours]:

@@ -888,6 +888,7 @@ def test_error_bars_begin_where_there_is_signal(npz, tmp_path, rng, second):
     main(["hks", str(npz), "-o", str(tmp_path / "out"), "--metric", "inverse", *words])
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     ratio = report["noise"]["signal_to_noise_with_rim"]  # all of so small a disc is near its rim
+    assert "z" in np.load(tmp_path / "out" / "hks.npz").files
     assert len(ratio) == len(report["times"]) == 3
     assert ratio[0] >= 1
     assert report["noise"]["sampling_error"] == pytest.approx(12**-0.5)
@@ -907,14 +908,20 @@ def test_error_bars_begin_where_there_is_signal(npz, tmp_path, rng, second):
 
 
 @pytest.mark.slow
-def test_the_rim_of_a_mask_is_no_signal(tmp_path):
+def test_the_rim_of_a_mask_is_no_signal(tmp_path, capsys):
     x, y = np.indices((28, 28)) - 13.5
     np.savez(tmp_path / "t.npz", tensors=np.broadcast_to(np.eye(2), (28, 28, 2, 2)), mask=np.hypot(x, y) < 13)
     words = ["-k", "100", "--times", "3", "8", "120", "--noise", "0.05", "--draws", "8", "--normalisation", "flat"]
-    assert main(["hks", str(tmp_path / "t.npz"), "-o", str(tmp_path / "out"), "--metric", "inverse", "-q", *words]) == 0
+    assert main(["hks", str(tmp_path / "t.npz"), "-o", str(tmp_path / "out"), "--metric", "inverse", *words]) == 0
+    told = capsys.readouterr().err
+    assert "signal-to-noise ratio: 0" in told
+    assert "no signal-to-noise ratio at t = 120: the boundary influences nearly all nodes" in told
     noise = json.loads((tmp_path / "out" / "report.json").read_text())["noise"]
     assert noise["interior"][0] > noise["interior"][1] > 0.2 > noise["interior"][2] == 0
-    assert max(noise["signal_to_noise"][:2]) < 1 < 4 < min(noise["signal_to_noise_with_rim"])
+    assert max(noise["signal_to_noise"][:2] + noise["signal_to_noise_with_rim"]) < 0.5
+    with np.load(tmp_path / "out" / "hks.npz") as saved:
+        known = np.isfinite(saved["z"])
+        assert np.mean(abs(saved["z"][known]) > 2) < 0.06
     assert noise["signal_to_noise"][2] is noise["exceeds_2_from_t"] is None
 
 

@@ -453,6 +453,10 @@ def test_what_noise_could_make_fades_into_grey():
     grey = np.asarray(figure.axes[0].images[1].get_array())
     assert grey.shape == (2, 3, 4)
     np.testing.assert_allclose(grey[..., 3].T, [[1, 0.5], [0, 0], [0, 0]])
+    place = TensorVolume(np.broadcast_to(np.eye(2), (3, 2, 2, 2)), grid.spacing, grid.origin)
+    figure = signature_panels(Result(place, values[None], np.array([1.0]), arrays={"z": z[None]}))
+    assert "noise alone leaves 5 % of the nodes without grey" in figure.get_suptitle()
+    assert "40 % without grey" in figure.axes[0].get_title()
 
 
 def test_pictures_are_cropped_and_coloured_away_from_the_rim():

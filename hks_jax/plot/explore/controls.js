@@ -60,6 +60,7 @@ function setUp() {
   for (const row of document.querySelectorAll(".volume")) row.hidden = dimension === 2;
   for (const row of document.querySelectorAll(".surface")) row.hidden = !surface;
   for (const row of document.querySelectorAll(".noise")) row.hidden = !deviations;
+  for (const row of document.querySelectorAll(".fades")) row.hidden = !scores;
   options(element("plane"), AXES.map((name, a) => `across ${name} (${AXES.filter((_, b) => b !== a).join(", ")})`));
   options(element("quantity"), quantities.map((q) => q.name));
   options(element("layer-name"), layers.map((layer) => layer.name));

@@ -20,6 +20,7 @@ const times = about.times;
 const inside = bytes("inside");
 const values = floats("values"); // for each time, at the inside nodes in the order of the grid
 const deviations = about.noise ? floats("deviation") : null; // the standard deviations of the values due to noise
+const scores = about.fades ? floats("z") : null; // distances from the values of constant tensors, as normal numbers
 const layers = about.layers.map((layer, i) => ({ ...layer, values: floats(`layer-${i}`) }));
 const labels = about.labels.length ? integers("labels") : null;
 

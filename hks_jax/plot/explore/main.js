@@ -51,15 +51,12 @@ const byScale = (scale, numberAt) => (node, rgb) => {
   [rgb[0], rgb[1], rgb[2]] = [scale.table[e], scale.table[e + 1], scale.table[e + 2]];
 };
 
-// Values within the noise of flat space, or of the mean, fade to grey. The fewer standard deviations, the greyer.
+// Values within the noise of those of constant tensors fade to grey. The smaller |z|, the greyer.
 function faded(colour) {
-  const { time, quantity } = state;
-  const middle = quantity === relative ? mean[time] : isFlat ? 1 : quantiles(count, (n) => values[time * count + n], [0.5])[0];
   const limit = Number(element("fade").value);
   return (node, rgb) => {
     colour(node, rgb);
-    const n = time * count + node;
-    const grey = 1 - Math.abs(values[n] - middle) / deviations[n] / limit;
+    const grey = 1 - Math.abs(scores[state.time * count + node]) / limit;
     if (grey > 0) for (let c = 0; c < 3; c++) rgb[c] += grey * (204 - rgb[c]);
   };
 }
@@ -127,7 +124,7 @@ function drawImages() {
 
   const scale = signatureScale();
   const coloured = byScale(scale, signatureAt);
-  images.signature.draw(deviations ? faded(coloured) : coloured, shared);
+  images.signature.draw(scores ? faded(coloured) : coloured, shared);
   showBar(element("signature-bar"), scale, quantity.centre);
   element("signature-name").textContent = `${quantity.name} at t = ${timeText(state.time)}`;
 
@@ -234,7 +231,7 @@ function showPoints() {
 function showControls() {
   const { axis, index } = planeOf();
   element("time-text").textContent = `t = ${timeText(state.time)}${spreadText(state.time)}`;
-  element("fade-text").textContent = `${element("fade").value} σ`;
+  element("fade-text").textContent = `|z| = ${element("fade").value}`;
   element("time").setAttribute("aria-valuetext", element("time-text").textContent);
   element("slice").max = shape[axis] - 1;
   element("slice").value = index;

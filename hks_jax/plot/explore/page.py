@@ -57,10 +57,11 @@ def explore(
         result: the signature at increasing times. Nodes without finite values at all times are omitted; on a surface,
             all values must be finite. The normalisations ``"raw"`` and ``"flat"`` are shown as (4πt)^(d/2)·HKS, which
             is 1 for flat space without boundary, with colours that diverge from 1. If ``arrays["deviation"]`` is given,
-            curves have error bands, and values fade if noise explains their difference from flat space, the mean or the
-            median. Tensors, if given, appear as mean eigenvalue, anisotropy and direction (red, green and blue for x, y
-            and z). With an affine, positions are shown in space, and the sides of images have the letters L and R, P
-            and A, I and S. For the metric D⁻¹, the diffusion length √(Dt) is shown beside t.
+            curves have error bands. If ``arrays["z"]`` (`hks_jax.Uncertainty.z`) is given, values fade if noise
+            explains their difference from constant tensors. Tensors, if given, appear as mean eigenvalue, anisotropy
+            and direction (red, green and blue for x, y and z). With an affine, positions are shown in space, and the
+            sides of images have the letters L and R, P and A, I and S. For the metric D⁻¹, the diffusion length √(Dt)
+            is shown beside t.
         path: the file of the page; its folder is created.
         maps: additional maps (*shape) by name.
         labels: (*shape) integers that define regions, 0 for none.
@@ -86,7 +87,7 @@ def explore(
     mesh, noise = result.place, result.arrays.get("deviation")
     if isinstance(mesh, TetMesh):
         raise ValueError(f"{result.source}: got a result on tetrahedra; expected a grid or a surface. Use ParaView")
-    t = checked_times(result.times, result.values.shape[1:], values=result.values, deviation=noise)
+    t = checked_times(result.times, result.values.shape[1:], values=result.values, deviation=noise, z=result.z)
     if not (np.isfinite(t).all() and t[0] > 0 and (np.diff(t) > 0).all()):
         raise ValueError(f"times: got {t}; expected positive numbers in increasing order")
     inside = np.isfinite(result.values).all(axis=0)
@@ -109,7 +110,8 @@ def explore(
             raise ValueError(f"maps[{name!r}]: got shape {np.shape(values)}; expected the grid's shape {inside.shape}")
         require_real(f"maps[{name!r}]", values)
         layers[name] = np.asarray(values)[inside]
-    size = 4 * (int(inside.sum()) * t.size * (2 if noise is not None else 1) + sum(map(np.size, layers.values())))
+    maps_shown = 1 + (noise is not None) + (result.z is not None)
+    size = 4 * (int(inside.sum()) * t.size * maps_shown + sum(map(np.size, layers.values())))
     if size > LIMIT:
         raise ValueError(
             f"values: {t.size} times at {int(inside.sum())} nodes take {size / 1024**2:.0f} MiB; expected at most "
@@ -120,6 +122,8 @@ def explore(
     shown = {"values": (scale * result.values)[:, inside]}
     if noise is not None:
         shown["deviation"] = (scale * noise)[:, inside]
+    if result.z is not None:
+        shown["z"] = result.z[:, inside]
     box = bounding_box(inside, margin=0)
     shown_inside = inside[inside] if surface else inside[box]
     numbers = {"inside": _base64(shown_inside, "u1")}
@@ -146,6 +150,7 @@ def explore(
         "fick": result.settings.get("operator") == "fick",
         "normalisation": result.normalisation,
         "noise": noise is not None,
+        "fades": result.z is not None,
         "start": [0] if surface else middle_node(shown_inside),
         "layers": [
             {"name": name, "kind": "scalar" if array.ndim == 1 else "direction"} for name, array in layers.items()
