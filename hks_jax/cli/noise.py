@@ -103,7 +103,7 @@ def with_error_bars(
         f"exceeds_{_CLEAR:g}_from_t": float(times[clear[0]]) if clear.size else None,
     }
     arrays = {"deviation": np.asarray(bars.deviation), "bias": np.asarray(bars.bias), "noise_maps": maps}
-    return replace(result, arrays=arrays, report={**result.report, "noise": report})
+    return replace(result, arrays={**result.arrays, **arrays}, report={**result.report, "noise": report})
 
 
 def noise_of_volume(

@@ -91,7 +91,9 @@ file FILE...
 --times T...
     positive numbers, in s for --metric inverse; or auto, or auto:N for N times that suit the eigenvalues, the last when
     √t is a third of the length of the domain (default auto:6). 'hks-jax info FILE' shows suitable times
---normalisation raw|heat-trace|volume|flat = raw  normalisation of the signature
+--normalisation raw|heat-trace|volume|flat = flat
+    normalisation of the signature: flat is (4πt)^(d/2)·HKS, which is 1 for flat space (default), raw is HKS itself,
+    volume is HKS times the volume of the domain, and heat-trace is HKS divided by its integral
 --method spectral|spectrum-free|auto = spectral
     method: a sum over eigenpairs (default), a computation without eigenpairs, or a choice by t, k and the spacing. For
     auto, the report lists the times of each method and their agreement

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from hks_jax import Grid, SurfaceMesh, TetMesh
 from hks_jax.arrays import describe_array
@@ -17,12 +17,15 @@ from hks_jax.checks import require_real
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.io.arrays import volume_of
 from hks_jax.io.files import save
-from hks_jax.io.units import median_mean_diffusivity
+from hks_jax.io.units import MEDIAN, median_mean_diffusivity, unit_of_times
 from hks_jax.io.volume import TensorVolume
+from hks_jax.signatures.rim import FREE
 from hks_jax.signatures.times import RESOLVED
 from hks_jax.storage import load_npz
 
 NAMES = ("hks", "curvature")
+KEPT = ("deviation", "bias", "noise_maps", "scaled_times", "input_tensors", "influence")
+"""The arrays of a file that a result keeps, beside its values, times and eigenvalues."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +39,8 @@ class Result:
         eigenvalues: (k,), or (0,) if they are unknown.
         report: facts about the computation; the entry ``settings`` contains its settings.
         arrays: more named arrays, saved with the result: ``deviation``, ``bias`` and ``noise_maps`` (n_draws, n_times,
-            *shape) for error bars, ``scaled_times`` (t times the first positive eigenvalue), and ``input_tensors``.
+            *shape) for error bars, ``scaled_times`` (t times the first positive eigenvalue), ``input_tensors``, and
+            ``influence`` (n_times, *shape), the influence of the boundary (`hks_jax.boundary_influence`).
         name: ``"hks"`` or ``"curvature"``.
         source: the file from which the result was read.
 
@@ -125,7 +129,7 @@ class Result:
             place = kind(arrays["vertices"], cells, mask=np.ones(cells.shape[:1], bool))
         eigenvalues, report = arrays.get("eigenvalues", np.zeros(0)), {"settings": record.get("settings") or {}}
         more = {
-            n: a for n, a in arrays.items() if n in ("deviation", "bias", "noise_maps", "scaled_times", "input_tensors")
+            n: a for n, a in arrays.items() if n in KEPT
         }
         return cls(place, values, times, eigenvalues, report, more, name, str(path))
 
@@ -187,12 +191,22 @@ class Result:
         return self.volume.tensors if known else None
 
     @property
-    def lengths(self) -> Float[np.ndarray, " n_times"] | None:
-        """(n_times,) the distances √(Dt), where D is the median mean diffusivity; None if the metric is not D⁻¹."""
+    def diffusivity(self) -> float | None:
+        """The D of √(Dt), the median of the tensors' mean eigenvalues in the domain; None if the metric is not D⁻¹."""
         if self.tensors is None or self.settings.get("metric") != "inverse":
             return None
-        diffusivity = median_mean_diffusivity(self.volume.with_mask(np.isfinite(self.values[0])))
-        return np.sqrt(diffusivity * self.times) if diffusivity else None
+        return median_mean_diffusivity(self.volume.with_mask(np.isfinite(self.values[0]))) or None
+
+    @property
+    def lengths(self) -> Float[np.ndarray, " n_times"] | None:
+        """(n_times,) the distances √(Dt) for the `diffusivity` D; None if D is not known."""
+        return None if self.diffusivity is None else np.sqrt(self.diffusivity * self.times)
+
+    @property
+    def near_rim(self) -> Bool[np.ndarray, "n_times *shape"] | None:
+        """(n_times, *shape) the nodes at which the boundary contributes over a tenth; None if this is not known."""
+        influence = self.arrays.get("influence")
+        return None if influence is None else influence >= FREE
 
     @property
     def z(self) -> Float[np.ndarray, "n_times *shape"] | None:
@@ -217,10 +231,19 @@ class Result:
 
     @property
     def unit(self) -> str:
-        """The unit of t: seconds for the metric D⁻¹ of tensors in mm²/s and lengths in mm; empty if it is not known."""
-        place = self.place
-        known = isinstance(place, TensorVolume) and place.unit and place.length_unit == "mm"
-        return "s" if known and self.settings.get("metric") == "inverse" else ""
+        """The unit of t: s for the metric D⁻¹ (`hks_jax.io.units.unit_of_times`); empty if it is not known."""
+        place, metric = self.place, self.settings.get("metric")
+        return unit_of_times(place, metric) if self.tensors is not None and isinstance(place, TensorVolume) else ""
+
+    @property
+    def units(self) -> dict[str, Any]:
+        """Facts for reports: the units of t and of √(Dt), and the diffusivity D with its definition."""
+        return {
+            "t": self.unit or "(metric length)²",
+            "length": self.length_unit or None,
+            "D": self.diffusivity,
+            "D_is": None if self.diffusivity is None else MEDIAN,
+        }
 
     @property
     def length_unit(self) -> str:

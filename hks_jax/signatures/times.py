@@ -1,4 +1,4 @@
-"""Checks of eigenpairs and times, default times and energies, and times that suit a metric without eigenpairs."""
+"""Checks of eigenpairs and times, default energies, and times that suit a metric without eigenpairs."""
 
 import math
 from typing import Any
@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Bool, Float
 
-from hks_jax.checks import checked_times, require_count, require_number
+from hks_jax.checks import checked_times, require_count
 from hks_jax.compilation import numpy_where_known
 from hks_jax.domain.components import label_nodes
 from hks_jax.eigen.eigenpairs import Eigenpairs, require_pairs
@@ -70,25 +70,6 @@ def _n_positive(pairs: Eigenpairs) -> int:
     if not is_traced((values, kept)):
         return int((np.asarray(kept) & (np.asarray(values) > 0)).sum())
     return pairs.k - pairs.n_null if pairs.null_space_known else pairs.k
-
-
-def default_times(pairs: Eigenpairs, n: int = 16, decay: float = 1e-4) -> Float[Array, " n"]:
-    """Return n times, log-spaced from 4 ln10/λ_last to 4 ln10/λ₁ (Sun, Ovsjanikov and Guibas 2009, section 5).
-
-    At the first of the n times the mode of λ_last has decayed to the fraction 1e-4. At the last of the n times, which
-    is not before the first, all modes except the constant have decayed to at most the fraction `decay`. With the decay
-    0.33 of the command line, √t at the last time is a third of the length of an interval with the same eigenvalue λ₁.
-
-    Examples:
-        >>> times = hj.default_times(pairs, 3)
-        >>> print((times[0] * pairs.eigenvalues[-1]).round(2), (times[-1] * pairs.eigenvalues[1]).round(2))  # 4 ln 10
-        9.21 9.21
-    """
-    require_count("n", n)
-    require_number("decay", decay, 1)
-    first, last = positive_range(pairs)
-    end = jnp.minimum(last, first * (math.log(1e-4) / math.log(decay)))
-    return 4 * jnp.log(10.0).astype(first.dtype) / jnp.geomspace(last, end, n)
 
 
 def default_energies(pairs: Eigenpairs, n: int = 100) -> tuple[Float[Array, " n"], Float[Array, ""]]:
