@@ -20,10 +20,9 @@ from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result
 from hks_jax.io.units import median_mean_diffusivity
 from hks_jax.signatures.hks import HKSMethod, Normalisation
-from hks_jax.signatures.rim import FREE, free_share, influence_of, is_estimated, is_known, rim_of
+from hks_jax.signatures.rim import free_share, influence_of, is_estimated, is_known, rim_of
 from hks_jax.signatures.spans import SHORTEST, resolved_span
-from hks_jax.signatures.times import default_k, times_of
-
+from hks_jax.signatures.times import FREE, default_k, times_of
 
 HALF = 0.45
 """The share of nodes free of the boundary below which a time is warned of; automatic times aim at one half."""

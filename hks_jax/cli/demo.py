@@ -28,7 +28,7 @@ from hks_jax.io.units import MM2_PER_S, median_mean_diffusivity
 OPTIONS = """
 -o,--output OUT = demo  folder for the results
 --phantom  use the phantom even if the brain is installed
-@view
+@view @rim
 """
 
 B_MAX = 1000.0
@@ -65,7 +65,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         rf"$4\pi t\,$HKS of {'a phantom' if brain is None else 'a brain slice'}, metric D⁻¹. The value 1 means flat; "
         "larger values mean positive curvature of the metric or the boundary"
     )
-    drawing = partial(signature_panels, result, title=title, view=args.view)
+    drawing = partial(signature_panels, result, title=title, view=args.view, show_rim=args.show_rim)
     done = write_outputs(args.output, result, progress, drawing, "" if brain is None else ".nii.gz")
     picture = next(file for file in done.files if file.suffix == ".png")
     return done._replace(text=f"The picture is {picture}")

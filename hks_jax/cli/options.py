@@ -119,6 +119,10 @@ file FILE...
 --view neurological|radiological = neurological
     orientation of pictures of a volume with an affine: neurological, left on the left (default), or radiological, left
     on the right. Front and head are at the top or on the right, for any storage order of the voxels
+[rim]
+--show-rim
+    draw the nodes near the boundary without hatching. Pictures hatch the nodes at which the boundary contributes over
+    10 % of the signature, where the shape of the domain shows and not curvature
 [common]
 --json  print a summary as JSON instead of the names of the files
 -q,--quiet  show no progress

@@ -19,8 +19,7 @@ from hks_jax.io.arrays import volume_of
 from hks_jax.io.files import save
 from hks_jax.io.units import MEDIAN, median_mean_diffusivity, unit_of_times
 from hks_jax.io.volume import TensorVolume
-from hks_jax.signatures.rim import FREE
-from hks_jax.signatures.times import RESOLVED
+from hks_jax.signatures.times import FREE, RESOLVED
 from hks_jax.storage import load_npz
 
 NAMES = ("hks", "curvature")
@@ -128,9 +127,7 @@ class Result:
             # Only a mesh with a mask may have vertices that belong to no cell, which are outside the domain.
             place = kind(arrays["vertices"], cells, mask=np.ones(cells.shape[:1], bool))
         eigenvalues, report = arrays.get("eigenvalues", np.zeros(0)), {"settings": record.get("settings") or {}}
-        more = {
-            n: a for n, a in arrays.items() if n in KEPT
-        }
+        more = {n: a for n, a in arrays.items() if n in KEPT}
         return cls(place, values, times, eigenvalues, report, more, name, str(path))
 
     def save(self, stem: Path, image: str, origin: Mapping[str, Any] | None = None) -> None:

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from hks_jax.arrays import nan_is_meant, nan_outside
 from hks_jax.compilation import numpy_where_known
-from hks_jax.domain.components import rim_nodes
+from hks_jax.domain.components import boundary_nodes
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.driver import eigenpairs
@@ -22,10 +22,9 @@ from hks_jax.fem.space import FunctionSpace, GridSpace, MeshSpace
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
 from hks_jax.signatures.filters import Heat
 from hks_jax.signatures.spectral_functions import spectral_diagonal
+from hks_jax.signatures.times import FREE
 from hks_jax.signatures.truncation import resolved_times
 
-FREE = 0.1
-"""The influence of the boundary below which a node counts as free of it: at a distance of 1.5 √t from a flat side."""
 _CANDIDATES = 24
 _STEPS, _TOLERANCE = 2000, 1e-7
 _ON_HOST = 1 << 28
@@ -116,9 +115,7 @@ def rim_of(pencil: AnyPencil) -> Bool[np.ndarray, "*shape"]:
         return np.concatenate(rims)
     if not isinstance(space, GridSpace):
         raise ValueError("domain: got eigenpairs of matrices or of vector fields, whose boundary is not known")
-    margins = [0 if wraps else 1 for wraps in space.periodic]
-    around = np.pad(space.elements, [(m, m) for m in margins])
-    return rim_nodes(around, space.periodic)[tuple(slice(m, -m or None) for m in margins)]
+    return boundary_nodes(space.elements, space.periodic)
 
 
 def is_known(pencil: AnyPencil) -> bool:
@@ -128,8 +125,8 @@ def is_known(pencil: AnyPencil) -> bool:
 
 # From the distance d to a straight side, the first passage time τ has E exp(−4τ/t) = exp(−2d/√t), and the function
 # u = E exp(−4τ/t) is 1 on the boundary and solves u = (t/4) Δu inside. The share exp(−d²/t) equals exp(−log²(u)/4).
-# Between two sides, u is nearly the sum of the functions of both sides, as is the share. The function w = 1 − u vanishes
-# on the boundary, so that one equation, (M + (t/4) K) w = M 1, serves for all boundary conditions.
+# Between two sides, u is nearly the sum of the functions of both sides, as is the share. The function w = 1 − u
+# vanishes on the boundary, so that one equation, (M + (t/4) K) w = M 1, serves for all boundary conditions.
 def _estimate(pencil: Pencil, rim: Bool[np.ndarray, "*shape"], times: Float[Array, " m"]) -> Float[Array, "m *shape"]:
     space = pencil.space
     inner = (space.free & ~rim).ravel()[np.flatnonzero(space.free.ravel())]

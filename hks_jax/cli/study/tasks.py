@@ -139,7 +139,7 @@ def _compute(study: Study, subject: Subject, fingerprint: str, progress: StudyPr
     noise = noise_of_volume(args, solved.volume, solved.field.grid, progress)
     result = signature_of(args, solved, noise, progress)
     result = replace(result, arrays={**scaled, **result.arrays})
-    drawing = partial(signature_panels, result, view=args.view)
+    drawing = partial(signature_panels, result, view=args.view, show_rim=args.show_rim)
     with progress.stage("writing"):
         study.write_signature(subject, fingerprint, result, progress.warnings, drawing)
 
