@@ -222,31 +222,25 @@ def _draw_mesh(result: Result, show_rim: bool, path: Path) -> None:
     """Draw the signature on the surface, or on the boundary of a solid, with a separate colour scale for each time."""
     from hks_jax.plot import new_figure, save_figure, surface
     from hks_jax.plot.images import colours_of
-    from hks_jax.plot.signature import LEAST_RANGE, caption, legend, titles_of
+    from hks_jax.plot.signature import LEAST_RANGE, caption, legend, nodes_for_colours, titles_of
 
     mesh = result.place
     assert isinstance(mesh, SurfaceMesh | TetMesh)
     cells, near = mesh.triangulation, None if show_rim else result.near_rim
     visible = cells.boundary_vertices if isinstance(mesh, TetMesh) else cells.used
     words = legend(result, near)
-    if near is not None and near[:, visible].all():  # always for solids; hatching would show nothing
-        near, words = (
-            None,
-            ["all vertices in the picture are on the boundary or near it, which raises or lowers values"],
-        )
+    if near is not None and near[:, visible].all():  # as on the boundary of a solid, where hatching would show nothing
+        near, words = None, ["the boundary contributes over 10 % at all vertices"]
     columns = min(len(result.times), 4)
     rows = math.ceil(len(result.times) / columns)
     figure = new_figure(3.4 * columns, 3.0 * rows + 0.3 + 0.3 * len(words))
     figure.suptitle("\n".join([caption(result), *words]))
     centre = 1.0 if result.normalisation == "flat" else None
-    shown = [
-        values[visible & ~(near[i] if near is not None and not near[i][visible].all() else False)]
-        for i, values in enumerate(result.values)
-    ]
+    shown = [values[nodes] for values, nodes in zip(result.values, nodes_for_colours(result, visible), strict=True)]
     colours = colours_of(shown, least_range=LEAST_RANGE, centre=centre)
     for i, (title, values, (low, high, cmap)) in enumerate(zip(titles_of(result), result.values, colours, strict=True)):
         ax = figure.add_subplot(rows, columns, i + 1, projection="3d")
-        style = {"vmin": low, "vmax": high, "cmap": cmap, "hatched": None if near is None else near[i]}
+        style: dict[str, Any] = {"vmin": low, "vmax": high, "cmap": cmap, "hatched": None if near is None else near[i]}
         figure.colorbar(surface(ax, mesh, values, **style), ax=ax, shrink=0.6)
         ax.set_title(title, fontsize="medium")
     save_figure(figure, path)

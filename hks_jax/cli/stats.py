@@ -93,8 +93,10 @@ def region_table(
     cells = {name: np.tile(of, n_regions) for name, of in by_time.items() if of is not None}
     cells |= {name: np.repeat(of, n_times) for name, of in by_region.items()}
     cells |= {"mean": regions.mean.T.ravel(), "std": regions.deviation.T.ravel(), "median": regions.median.T.ravel()}
-    if "influence" in result.arrays:  # the labels' nodes with and without influence of the boundary, at each time
-        share = region_statistics(np.where(np.isfinite(values), ~result.near_rim, np.nan), labels).mean
+    if (
+        near := result.near_rim
+    ) is not None:  # the labels' nodes with and without influence of the boundary, at each time
+        share = region_statistics(np.where(np.isfinite(values), ~near, np.nan), labels).mean
         cells["free_of_rim"] = share.T.ravel()
         if late := int((share < HALF).any(axis=0).sum()):
             progress.warn(

@@ -128,14 +128,16 @@ def titles_of(result: Result, unit: str | None = None) -> Sequence[str]:
 def _colours(result: Result, inside: Bool[np.ndarray, "*shape"]) -> list[Colours]:
     """Return the colours for each time, which span nearly all values away from the boundary."""
     centre = 1.0 if result.normalisation == "flat" else None
+    chosen = nodes_for_colours(result, inside if result.near_rim is not None else away_from_rim(inside))
+    images = [values[nodes] for values, nodes in zip(result.values, chosen, strict=True)]
+    return colours_of(images, SPAN, LEAST_RANGE, centre)
+
+
+def nodes_for_colours(result: Result, nodes: Bool[np.ndarray, "*shape"]) -> list[Bool[np.ndarray, "*shape"]]:
+    """Return those of the nodes at each time that are free of the boundary; all nodes if these are few or not known."""
     near = result.near_rim
-    if near is not None:
-        # A few nodes do not represent the range, and without any free node the range is that of all nodes.
-        free = [inside & ~each for each in near]
-        deep = [one if one.sum() > ENOUGH * inside.sum() else inside for one in free]
-    else:
-        deep = [away_from_rim(inside)] * len(result.values)
-    return colours_of([values[one] for values, one in zip(result.values, deep, strict=True)], SPAN, LEAST_RANGE, centre)
+    free = [nodes if near is None else nodes & ~near[i] for i in range(len(result.values))]
+    return [one if one.sum() > ENOUGH * nodes.sum() else nodes for one in free]
 
 
 def cropped(volume: TensorVolume | Grid, inside: Bool[np.ndarray, "*shape"]) -> tuple[Grid, tuple[slice, ...]]:

@@ -96,7 +96,9 @@ def orthogonal_slices(
         normal = 3 - first - second
         plane = (np.take(of, (first, second)).tolist() for of in (grid.shape, grid.spacing, grid.origin))
         slab = np.take(array, chosen[normal], axis=normal)
-        cut = {n: None if mask is None else mask.take(chosen[normal], axis=normal) for n, mask in masks.items()}
+        cut: dict[str, Any] = {
+            n: None if mask is None else mask.take(chosen[normal], axis=normal) for n, mask in masks.items()
+        }
         image = scalar_image(ax, slab, Grid(*plane), colorbar=False, **cut, **style)
         if orientation is not None:
             orientation.letter(ax, (first, second))
@@ -178,7 +180,12 @@ def volume_panels(
                 for ax in panels[:, column]:
                     ax.remove()
                 continue
-            style = {"node": node, "orientation": orientation, "z": noise[index], "hatched": lines[index]}
+            style: dict[str, Any] = {
+                "node": node,
+                "orientation": orientation,
+                "z": noise[index],
+                "hatched": lines[index],
+            }
             image = orthogonal_slices(panels[:3, column], volumes[index], grid, **style, **colours[index])
             panels[0, column].set_title(titles[index], fontsize="medium")
             for ax, (first, second) in zip(panels[:3, column], PLANES, strict=True):

@@ -154,7 +154,7 @@ def _hitting(xp: Any, stiffness: Any, mass: Any, inner: Any, times: Any) -> Any:
     return xp.exp(-(xp.log(u) ** 2) / 4).T
 
 
-def free_share(influence: Float[Array, "m *shape"], space: FunctionSpace) -> Float[Array, " m"]:
+def free_share(influence: Float[Array | np.ndarray, "m *shape"], space: FunctionSpace) -> Float[Array, " m"]:
     """Return the share of the domain's nodes at which the boundary's influence is below `FREE`, at each time."""
     return jnp.sum((jnp.asarray(influence) < FREE).reshape(len(influence), -1), axis=1) / space.domain.sum()
 
