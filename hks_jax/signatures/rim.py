@@ -93,9 +93,9 @@ def is_estimated(pairs: Eigenpairs) -> bool:
 
 def influence_of(pairs: Eigenpairs, times: Float[Array, " m"]) -> Float[Array, "m *shape"]:
     """Return `boundary_influence` of eigenpairs without warnings of unresolved times."""
-    rim, parts = rim_of(pairs.pencil), pairs.pencil.parts
     if not is_known(pairs.pencil):
-        raise ValueError("domain: got eigenpairs of an operator without a metric; expected a field's or a mesh's own")
+        raise ValueError("domain: got eigenpairs of other matrices; expected eigenpairs of a field or a mesh")
+    rim, parts = rim_of(pairs.pencil), pairs.pencil.parts
     if rim.any() and not is_estimated(pairs):
         return _share(*(spectral_diagonal(pairs.of_part(i), Heat(times)) for i in (0, len(parts) - 1)))
     return _estimate(parts[0], rim, jax.lax.stop_gradient(times))
@@ -107,14 +107,13 @@ def _share(neumann: Float[Array, "m *shape"], dirichlet: Float[Array, "m *shape"
 
 
 def rim_of(pencil: AnyPencil) -> Bool[np.ndarray, "*shape"]:
-    """Mark the nodes on all sides that are not periodic, and on the rim of a mask; raise ValueError if unknown."""
+    """Mark the nodes on all sides that are not periodic, and on the rim of a mask."""
     space = pencil.space
     if isinstance(space, MeshSpace):
         cells = space.triangulation
         rims = [cells.boundary_vertices] + [cells.boundary_edges] * (space.degree == 2)
         return np.concatenate(rims)
-    if not isinstance(space, GridSpace):
-        raise ValueError("domain: got eigenpairs of matrices or of vector fields, whose boundary is not known")
+    assert isinstance(space, GridSpace)
     return boundary_nodes(space.elements, space.periodic)
 
 

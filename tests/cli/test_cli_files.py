@@ -144,7 +144,9 @@ def test_the_times_that_info_names_are_those_of_the_spectrum(tmp_path, capsys):
     eigenvalues = np.sort((np.pi**2 * ((i / a) ** 2 + (j / b) ** 2)).ravel())
     assert suits["k"] == 200
     assert suits["least_time_of_k"] == pytest.approx(4.6 / eigenvalues[200], rel=0.2)  # where the tail is 1 %
-    assert suits["largest_time"] == pytest.approx(max(a, b) ** 2 / 4, rel=0.1)  # √t is half the longer side
+    assert suits["time_by_size"] == pytest.approx(max(a, b) ** 2 / 4, rel=0.1)  # √t is half the longer side
+    depth = (a + b - np.sqrt(a**2 + b**2)) / 4  # (a − 2d)(b − 2d) = ab/2, and exp(−d²/t) = 1/10
+    assert suits["largest_time"] == pytest.approx(depth**2 / np.log(10), rel=0.1)
     assert suits["least_time"] == pytest.approx(6 * max(2 * 0.1**2, 0.5 * 0.2**2))
     needed = np.searchsorted(eigenvalues, 4.6 / suits["least_time"])
     assert suits["k_for_least_time"] == pytest.approx(needed, rel=0.2)
@@ -161,10 +163,10 @@ def test_what_info_names_of_a_masked_domain_is_of_its_pieces_and_of_the_mean(tmp
         return found["suits"]["tensor"]
 
     assert suits((90, 80), 3) == (small := suits((45, 40), 1))
-    assert small["largest_time"] == pytest.approx((29 / 2) ** 2)
+    assert small["time_by_size"] == pytest.approx((29 / 2) ** 2)
     grid = hj.Grid((30, 24))
     values = hj.eigenpairs(hj.TensorField(grid, np.broadcast_to(np.eye(2), (30, 24, 2, 2))), 200, "mean").eigenvalues
-    assert small["largest_time"] == pytest.approx(np.pi**2 / 4 / float(values[1]), rel=0.01)
+    assert small["time_by_size"] == pytest.approx(np.pi**2 / 4 / float(values[1]), rel=0.01)
     assert small["least_time_of_k"] == pytest.approx(4.6 / float(values[-1]), rel=0.25)
 
 

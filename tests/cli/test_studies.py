@@ -23,7 +23,7 @@ import hks_jax as hj
 from hks_jax.cli import build_parser, main
 from hks_jax.cli.computation import Settings
 from hks_jax.cli.progress import StudyProgress
-from hks_jax.cli.study.batch import common_times, suitable_range
+from hks_jax.cli.study.batch import Range, common_times, suitable_range
 from hks_jax.cli.study.folder import Study
 from hks_jax.cli.study.subjects import read_subjects
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
@@ -427,12 +427,15 @@ def test_rows_join_the_options_of_the_command(tmp_path):
 
 
 def test_common_times_suit_all_subjects():
-    ranges = {"sub-01": (2.0, 50.0), "sub-02": (3.0, 80.0)}
-    assert common_times(ranges, 3, "scanner") == (3.0, 12.2, 50.0)
+    ranges = {"sub-01": Range(2.0, 25.0, 50.0), "sub-02": Range(3.0, 48.0, 80.0)}
+    assert common_times(ranges, 3, "scanner") == (3.0, 8.66, 25.0)
     scaled = common_times(ranges, 2, "lambda1")
-    np.testing.assert_allclose(scaled, np.pi**2 / 4 * np.array([2 / 50, 1]), rtol=5e-3)
+    np.testing.assert_allclose(scaled, np.pi**2 / 4 * np.array([2 / 50, 1 / 2]), rtol=5e-3)
+    # If half of the voxels are free of the boundary only at unresolved times, the times are the first resolved ones.
+    assert common_times({"sub-01": Range(4.0, 1.0, 50.0)}, 2, "scanner") == (4.0, 8.0)
+    assert common_times({"sub-01": Range(4.0, 1.0, 5.0)}, 2, "scanner") == (4.0, 5.0)
     with pytest.raises(ValueError, match="sub-02 resolves only t ≥ 4, and the size of sub-01 allows only t ≤ 3"):
-        common_times({"sub-01": (2.0, 3.0), "sub-02": (4.0, 9.0)}, 3, "scanner")
+        common_times({"sub-01": Range(2.0, 1.0, 3.0), "sub-02": Range(4.0, 5.0, 9.0)}, 3, "scanner")
 
 
 def test_automatic_times_follow_the_metric_and_remain_those_of_the_study(study, monkeypatch, capsys):
@@ -446,7 +449,7 @@ def test_automatic_times_follow_the_metric_and_remain_those_of_the_study(study, 
     np.testing.assert_allclose(suitable(2.0, 8, "neumann"), suitable(1.0, 8, "neumann") / 2, rtol=1e-12)
     np.testing.assert_allclose(suitable(1.0, 8, "mean"), suitable(1.0, 4, "neumann"), rtol=1e-12)
     side = 54.0  # mm, of the largest axis, along which D is about 1.5e-3 mm²/s
-    assert abs(suitable(1.0, 8, "neumann")[1] / ((side / 2) ** 2 / 1.5e-3) - 1) < 0.3
+    assert abs(suitable(1.0, 8, "neumann")[2] / ((side / 2) ** 2 / 1.5e-3) - 1) < 0.3
     assert suitable(1.0, 1, "neumann")[0] > suitable(1.0, 8, "neumann")[0]
 
     def times(*more):
