@@ -20,10 +20,12 @@ from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result
 from hks_jax.io.units import median_mean_diffusivity
 from hks_jax.signatures.hks import HKSMethod, Normalisation
-from hks_jax.signatures.rim import free_share, influence_of, is_estimated, is_known, rim_of
+from hks_jax.signatures.rim import estimate_of, free_share, influence_of, is_estimated, is_known, rim_of
 from hks_jax.signatures.spans import SHORTEST, resolved_span
 from hks_jax.signatures.times import FREE, default_k, times_of
 
+EARLY = 0.02
+"""The truncated share of the signature above which the boundary's influence is estimated without eigenpairs."""
 HALF = 0.45
 """The share of nodes free of the boundary below which a time is warned of; automatic times aim at one half."""
 
@@ -100,7 +102,13 @@ def result_of(
 
 def _influence(pairs: hj.Eigenpairs, times: tuple[float, ...]) -> np.ndarray | None:
     """Return the influence of the boundary (n_times, *shape), or None if it is not known."""
-    return np.asarray(influence_of(pairs, times_of(pairs, times))) if is_known(pairs.pencil) else None
+    if not is_known(pairs.pencil):
+        return None
+    t = times_of(pairs, times)
+    found, early = np.array(influence_of(pairs, t)), np.asarray(hj.truncation(pairs, t).tail) > EARLY
+    if early.any():  # the eigenpairs do not resolve the signatures of the two problems
+        found[early] = np.asarray(estimate_of(pairs, t[early]))
+    return found
 
 
 def _rim_report(pairs: hj.Eigenpairs, influence: np.ndarray | None) -> dict[str, Any]:

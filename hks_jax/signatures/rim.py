@@ -95,10 +95,14 @@ def influence_of(pairs: Eigenpairs, times: Float[Array, " m"]) -> Float[Array, "
     """Return `boundary_influence` of eigenpairs without warnings of unresolved times."""
     if not is_known(pairs.pencil):
         raise ValueError("domain: got eigenpairs of other matrices; expected eigenpairs of a field or a mesh")
-    rim, parts = rim_of(pairs.pencil), pairs.pencil.parts
-    if rim.any() and not is_estimated(pairs):
-        return _share(*(spectral_diagonal(pairs.of_part(i), Heat(times)) for i in (0, len(parts) - 1)))
-    return _estimate(parts[0], rim, jax.lax.stop_gradient(times))
+    if rim_of(pairs.pencil).any() and not is_estimated(pairs):
+        return _share(*(spectral_diagonal(pairs.of_part(i), Heat(times)) for i in (0, len(pairs.pencil.parts) - 1)))
+    return estimate_of(pairs, times)
+
+
+def estimate_of(pairs: Eigenpairs, times: Float[Array, " m"]) -> Float[Array, "m *shape"]:
+    """Return the estimate of `boundary_influence` from first passage times, which needs no eigenpairs."""
+    return _estimate(pairs.pencil.parts[0], rim_of(pairs.pencil), jax.lax.stop_gradient(times))
 
 
 def _share(neumann: Float[Array, "m *shape"], dirichlet: Float[Array, "m *shape"]) -> Float[Array, "m *shape"]:

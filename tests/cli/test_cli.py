@@ -102,7 +102,7 @@ def test_npz_end_to_end_equals_the_library(npz, tmp_path, capsys):
         assert stage in captured.err
 
     grid = hj.Grid(SHAPE, (0.5, 0.25), (1.0, 2.0), disc())
-    expected = hj.hks(hj.eigenpairs(hj.TensorField(grid, metric()), 25, "mean"), [0.7, 2.0, 8.0])
+    expected = hj.hks(hj.eigenpairs(hj.TensorField(grid, metric()), 25, "mean"), [0.7, 2.0, 8.0], "flat")
     with np.load(out / "hks.npz") as read:
         np.testing.assert_allclose(read["hks"], expected, rtol=1e-9)
         np.testing.assert_array_equal(read["times"], [0.7, 2, 8])
@@ -115,7 +115,7 @@ def test_times_that_do_not_suit_the_domain_are_reported(npz, tmp_path):
     out = tmp_path / "out"
     assert main(["hks", str(npz), "-o", str(out), "-q", "-k", "25", "--times", "0.01", "2", "500"]) == 0
     warnings = json.loads((out / "report.json").read_text())["warnings"]
-    assert any("1 of 3 times are too large" in each for each in warnings)
+    assert any("at 2 of 3 times, most nodes feel the boundary: at t = 2, 500" in each for each in warnings)
     assert any("1 of 3 times are too small" in each for each in warnings)
     assert ["too few eigenpairs" in title for title in signature.titles_of(Result.read(out))] == [True, False, False]
 
@@ -137,7 +137,7 @@ def test_report_says_what_was_done(npz, tmp_path, capsys):
         "times": "explicit",
         "components": "raise",
         "solver": "auto",
-        "normalisation": "raw",
+        "normalisation": "flat",
         "method": "spectral",
         "dtype": "float64",
     }
@@ -544,6 +544,7 @@ def test_nothing_is_left_of_an_interrupted_or_failed_write(npz, tmp_path, capsys
 
     monkeypatch.setattr(outputs_module, "versions", fail)  # the last step, when all but the report is written
     before = sorted(tmp_path.iterdir())
+    monkeypatch.setattr("hks_jax.cli.computation.HALF", 0.0)  # without a warning of times at which all feel the rim
     arguments = ["hks", str(npz), "-o", str(tmp_path / "out"), "-k", "10", "--times", "2"]
     assert one_error(capsys, main(arguments), "interrupted" if code == 130 else "disk full") == code
     assert sorted(tmp_path.iterdir()) == before

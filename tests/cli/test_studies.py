@@ -303,7 +303,7 @@ def test_a_study_is_a_bids_derivative(study, monkeypatch):
 
     # The regions of a signature that is computed again without labels are gone.
     assert (out / "group_regions.tsv").is_file()
-    words = command(study, "out", "--times", "3e3", "--only", "sub-01", "--replace", "--normalisation", "flat", "-q")
+    words = command(study, "out", "--times", "3e3", "--only", "sub-01", "--replace", "--normalisation", "raw", "-q")
     assert main([word for word in words if word not in ("--atlas", str(atlas))]) == 0
     assert not list(out.rglob("*regions*"))
 
@@ -328,7 +328,7 @@ def test_one_bad_subject_does_not_stop_the_others(study, monkeypatch, capsys):
 
 def test_subjects_in_other_units_are_refused_and_open_frames_are_said(study, monkeypatch, capsys):
     monkeypatch.setattr(
-        "hks_jax.cli.study.tasks.signature_panels", lambda result, path, view: path.write_text("picture")
+        "hks_jax.cli.study.tasks.signature_panels", lambda result, path, **_: path.write_text("picture")
     )
     image = nib.load(study / "t1.nii.gz")
     for number, matrix, scale in ((4, AFFINE, 1e6), (5, AFFINE, 1e6), (6, AFFINE @ np.diag([-1.0, 1, 1, 1]), 1.0)):
@@ -358,7 +358,7 @@ def test_subjects_in_other_units_are_refused_and_open_frames_are_said(study, mon
 
 def test_numbers_without_a_unit_are_compared_within_the_study(study, monkeypatch, capsys):
     monkeypatch.setattr(
-        "hks_jax.cli.study.tasks.signature_panels", lambda result, path, view: path.write_text("picture")
+        "hks_jax.cli.study.tasks.signature_panels", lambda result, path, **_: path.write_text("picture")
     )
     for i, scale in enumerate((1e3, 0.8e3, 1e6)):  # two in um2/ms, one in um2/s
         np.savez(study / f"n{i}.npz", tensors=tensors(scale), spacing=(2.0, 2.0, 3.0))
@@ -630,7 +630,7 @@ def test_a_study_keeps_the_boundary_that_it_began_with(study, monkeypatch, capsy
 def test_omitted_options_are_those_of_the_study(study, monkeypatch, capsys):
     monkeypatch.setattr("hks_jax.cli.study.tasks.run_all", lambda *_: {})
     monkeypatch.setattr(Study, "write_group", lambda *_: [])
-    kept = ["--normalisation", "flat", "--repair", "clip:1e-4", "--times", "3e3", "6e3", "--time-unit", "lambda1"]
+    kept = ["--normalisation", "raw", "--repair", "clip:1e-4", "--times", "3e3", "6e3", "--time-unit", "lambda1"]
     assert main(command(study, "out", "--erode", "0", *kept)) == 0
     record = (study / "out" / "study.json").read_text()
     capsys.readouterr()
@@ -638,16 +638,16 @@ def test_omitted_options_are_those_of_the_study(study, monkeypatch, capsys):
     assert main(short) == 0
     assert (study / "out" / "study.json").read_text() == record
     printed = capsys.readouterr().err
-    for option in ("-k 8", "--slice z=1", "--repair clip:0.0001", "--times 3000.0,6000.0", "--normalisation flat"):
+    for option in ("-k 8", "--slice z=1", "--repair clip:0.0001", "--times 3000.0,6000.0", "--normalisation raw"):
         assert option in printed
-    assert main([*short, "-k", "9", "--normalisation", "raw", "--times", "auto:4", "--noise", "0.1"]) == 2
+    assert main([*short, "-k", "9", "--normalisation", "flat", "--times", "auto:4", "--noise", "0.1"]) == 2
     printed = capsys.readouterr().err
-    for text in ("-k 8, not 9;", "--normalisation flat, not raw;", "--times 3000.0,6000.0, not auto:4;"):
+    for text in ("-k 8, not 9;", "--normalisation raw, not flat;", "--times 3000.0,6000.0, not auto:4;"):
         assert text in printed
     assert "--noise unset, not 0.1" in printed
     assert "Leave these options out to continue the study" in printed
     assert main([*short, "-k", "9", "--metric", "inverse", "--slice", "z=1", "--times", "9", "--replace"]) == 0
-    assert json.loads((study / "out" / "study.json").read_text())["settings"]["normalisation"] == "raw"
+    assert json.loads((study / "out" / "study.json").read_text())["settings"]["normalisation"] == "flat"
 
 
 @pytest.mark.slow
