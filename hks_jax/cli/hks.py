@@ -14,7 +14,7 @@ along the fourth axis of the image.
 examples:
   hks-jax hks tensor.nii.gz -o out --metric inverse
   hks-jax hks tensor.nii.gz -o out --mask mask.nii.gz --slice z=14 --metric inverse -k 100 --times auto:8
-  hks-jax hks out/pairs.npz -o later --times auto:24 --normalisation flat
+  hks-jax hks out/pairs.npz -o later --times auto:24
   hks-jax hks heart.vtu -o out --array D --metric inverse -k 50
   hks-jax hks lh.white --tensors dti.nii.gz -o out --metric inverse
   hks-jax hks dwi.nii.gz --bval dwi.bval --bvec dwi.bvec -o out --slice z=10 --metric inverse --components largest

@@ -89,8 +89,9 @@ file FILE...
 --solver SOLVER = auto  eigensolver
 [signature] the signature
 --times T...
-    positive numbers, in s for --metric inverse; or auto, or auto:N for N times that suit the eigenvalues, the last when
-    √t is a third of the length of the domain (default auto:6). 'hks-jax info FILE' shows suitable times
+    positive numbers, in s for --metric inverse of tensors in mm2/s; or auto, or auto:N for N times from the first that
+    the eigenpairs resolve to the time at which half of the nodes are free of the boundary (influence below 10 %), at
+    least a factor of 2 apart (default auto:6). 'hks-jax info FILE' shows suitable times
 --normalisation raw|heat-trace|volume|flat = flat
     normalisation of the signature: flat is (4πt)^(d/2)·HKS, which is 1 for flat space (default), raw is HKS itself,
     volume is HKS times the volume of the domain, and heat-trace is HKS divided by its integral

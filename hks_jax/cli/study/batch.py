@@ -25,7 +25,7 @@ If a subject fails, the others are still computed. If the command is repeated, i
 tables that are missing, or whose input files have changed. A repeated command takes omitted options from the study.
 
 examples:
-  hks-jax batch subjects.tsv -o study --metric inverse --normalisation flat --atlas atlas.nii.gz
+  hks-jax batch subjects.tsv -o study --metric inverse --atlas atlas.nii.gz
   hks-jax batch subjects.tsv -o study --metric inverse --times 8e5 1.6e6 3.2e6 --only sub-07 sub-08
 """
 
