@@ -146,6 +146,9 @@ class Result:
         times = {"times": self.times} if self.times.size else {}
         extra = {**times, **({"eigenvalues": self.eigenvalues} if self.eigenvalues.size else {}), **self.arrays}
         record = {**(origin or {}), "settings": plain(self.settings), **times}
+        if self.times.size:
+            lengths = None if self.lengths is None else self.lengths.tolist()
+            record |= {"units": self.units, "lengths": lengths}
         for suffix in filter(None, (".npz", image)):
             given: dict[str, Any] = times if suffix.startswith(".nii") else extra
             if suffix == ".npz" and isinstance(self.place, TensorVolume):
