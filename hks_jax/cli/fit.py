@@ -1,8 +1,8 @@
 """Find the metric that has a given signature.
 
 Find the metric that has a given heat kernel signature. TARGET is an npz that 'hks-jax hks' wrote with the
-normalisation flat, the default, or raw. TARGET contains 'hks' (n_times, *shape), 'times', 'spacing', 'origin', and optionally 'mask' and
-'affine'.
+normalisation flat, the default, or raw. TARGET contains 'hks' (n_times, *shape), 'times', 'spacing', 'origin', and
+optionally 'mask' and 'affine'.
 
 The command writes to the folder OUT: tensors.npz (the metric), fit.npz (its signature, and the loss at each step),
 fit.png (in two dimensions) and report.json. Ctrl-C ends the fit and writes the best metric found until then.
