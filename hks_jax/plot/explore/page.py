@@ -89,7 +89,7 @@ def explore(
         '<!doctype html>'
     """
     require_result(result)
-    axes, turned = None, None
+    axes, turned, facts = None, None, _facts(result)
     if isinstance(result.place, TensorVolume) and (turned := placed(result.place, None, view)) is not None:
         result, maps, labels, axes = _turned(result, maps, labels, turned)
     mesh, noise = result.place, result.arrays.get("deviation")
@@ -142,7 +142,7 @@ def explore(
         numbers["labels"], names = _regions(labels, label_names, inside)
     about = {
         "title": title,
-        "facts": [[name, str(value)] for name, value in _facts(result).items()],
+        "facts": [[name, str(value)] for name, value in facts.items()],
         "software": f"hks-jax {__version__}",
         "dimension": result.dimension,
         "mesh": bool(surface),
