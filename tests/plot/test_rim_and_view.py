@@ -195,7 +195,7 @@ def test_the_command_line_tells_of_the_rim(tmp_path, capsys):
     last = lines[4::4]
     assert sum(float(r[column]) * int(r[voxels]) for r in last) == pytest.approx(shares[-1] * inside.sum(), rel=1e-6)
     # One problem: an estimate, and a time at which all feel the boundary.
-    late = ["--boundary", "neumann", "-k", "40", "--times", "0.05", "1"]
+    late = ["--boundary", "neumann", "-k", "60", "--times", "0.02", "1"]
     assert main(["hks", str(tmp_path / "t.npz"), "-o", str(out), *late, "-q"]) == 0
     assert (
         "at 1 of 2 times, most nodes feel the boundary: at t = 1, it contributes over 10 %" in capsys.readouterr().err
