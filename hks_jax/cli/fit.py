@@ -1,8 +1,8 @@
 """Find the metric that has a given signature.
 
-Find the metric that has a given heat kernel signature. TARGET is an npz that 'hks-jax hks' wrote without
-normalisation. TARGET contains 'hks' (n_times, *shape), 'times', 'spacing', 'origin', and optionally 'mask' and
-'affine'.
+Find the metric that has a given heat kernel signature. TARGET is an npz that 'hks-jax hks' wrote with the
+normalisation flat, the default, or raw. TARGET contains 'hks' (n_times, *shape), 'times', 'spacing', 'origin', and
+optionally 'mask' and 'affine'.
 
 The command writes to the folder OUT: tensors.npz (the metric), fit.npz (its signature, and the loss at each step),
 fit.png (in two dimensions) and report.json. Ctrl-C ends the fit and writes the best metric found until then.
@@ -92,13 +92,15 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     use_dtype(args.dtype)
     with progress.stage("reading", str(args.target)):
         target = Result.read(args.target, "hks", over_times=True)
-        if target.normalisation != "raw":
+        if target.normalisation not in ("raw", "flat"):
             raise ValueError(
-                f"TARGET: got {target.source} with the normalisation {target.normalisation}; expected raw. Compute "
-                "it by 'hks-jax hks' without --normalisation"
+                f"TARGET: got {target.source} with the normalisation {target.normalisation}; expected raw or flat. "
+                "Compute it by 'hks-jax hks' without --normalisation"
             )
         args.operator = args.operator or target.settings.get("operator", "laplace-beltrami")
         require_one(args)
+        if target.normalisation == "flat":
+            target = replace(target, values=target.values / target.to_flat)
         # The mask is the domain of the computed signature, so all of its components belong to the domain.
         grid = target.grid
         init = _initial(args, target.volume, grid, progress)

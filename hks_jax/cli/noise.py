@@ -21,14 +21,13 @@ from hks_jax.cli.reading import read_volume
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result
 from hks_jax.io.volume import require_position
+from hks_jax.signatures.times import FREE
 from hks_jax.uncertainty.propagate import LEAST
 
 _CANDIDATES = 4
 """The number of candidate times for each automatic time."""
 _SIGNAL = 1.0
 """The signal-to-noise ratio at which automatic times begin."""
-_RIM = 0.1
-"""The influence of the boundary on the signature (`boundary_influence`) below which a node is in the interior."""
 _LEAST = 0.1
 """The least share of nodes in the interior; fewer nodes do not represent the variation of a map."""
 _CLEAR = 2.0
@@ -108,7 +107,7 @@ def with_error_bars(
     level = jnp.nanmedian(bars.value - bars.null, axis=axes, keepdims=True) if by_domain else 0.0
     z = bars.z(bars.null + level)
     arrays = {"deviation": bars.deviation, "bias": bars.bias, "z": z, "noise_maps": maps}
-    arrays = {name: np.asarray(array) for name, array in arrays.items()}
+    arrays = {**result.arrays, **{name: np.asarray(array) for name, array in arrays.items()}}
     return replace(result, arrays=arrays, report={**result.report, "noise": report})
 
 
@@ -174,7 +173,7 @@ def _error_bars(
         interior = np.isfinite(np.asarray(bars.value))
         if len(pairs.pencil.parts) == 2:
             nodes = interior[0].sum()
-            interior &= np.asarray(hj.boundary_influence(pairs, times)) < _RIM
+            interior &= np.asarray(hj.boundary_influence(pairs, times)) < FREE
             interior[interior.reshape(len(times), -1).sum(axis=1) < _LEAST * nodes] = False
     chosen = np.arange(len(times))
     if not settings.times.explicit:

@@ -95,10 +95,12 @@ file FILE...
 --solver SOLVER = auto  eigensolver
 [signature] the signature
 --times T...
-    positive numbers, in s for --metric inverse and --operator fick; or auto, or auto:N for N times that suit the
-    eigenvalues, the last when √t is a third of the length of the domain (default auto:6). 'hks-jax info FILE' shows
-    suitable times
---normalisation raw|heat-trace|volume|flat = raw  normalisation of the signature
+    positive numbers, in s for --metric inverse and --operator fick of tensors in mm2/s; or auto, or auto:N for N times
+    from the first that the eigenpairs resolve to the time at which half of the nodes are free of the boundary
+    (influence below 10 %), at least a factor of 2 apart (default auto:6). 'hks-jax info FILE' shows suitable times
+--normalisation raw|heat-trace|volume|flat = flat
+    normalisation of the signature: flat is (4πt)^(d/2)·HKS, which is 1 for flat space (default), raw is HKS itself,
+    volume is HKS times the volume of the domain, and heat-trace is HKS divided by its integral
 --method spectral|spectrum-free|auto = spectral
     method: a sum over eigenpairs (default), a computation without eigenpairs, or a choice by t, k and the spacing. For
     auto, the report lists the times of each method and their agreement
@@ -124,6 +126,10 @@ file FILE...
 --view neurological|radiological = neurological
     orientation of pictures of a volume with an affine: neurological, left on the left (default), or radiological, left
     on the right. Front and head are at the top or on the right, for any storage order of the voxels
+[rim]
+--show-rim
+    draw the nodes near the boundary without hatching. Pictures hatch the nodes at which the boundary contributes over
+    10 % of the signature, where the shape of the domain shows and not curvature
 [common]
 --json  print a summary as JSON instead of the names of the files
 -q,--quiet  show no progress

@@ -58,6 +58,13 @@ def rim_nodes(elements: np.ndarray, periodic: tuple[bool, ...]) -> Bool[np.ndarr
     return element_nodes(elements, periodic) & element_nodes(~elements, periodic)
 
 
+def boundary_nodes(elements: np.ndarray, periodic: tuple[bool, ...]) -> Bool[np.ndarray, "*shape"]:
+    """Mark the nodes on the rim of a mask and on the sides of the grid that are not periodic."""
+    margins = [0 if wraps else 1 for wraps in periodic]
+    around = np.pad(elements, [(m, m) for m in margins])
+    return rim_nodes(around, periodic)[tuple(slice(m, -m or None) for m in margins)]
+
+
 def label_nodes(mask: Bool[np.ndarray, "*shape"], periodic: tuple[bool, ...]) -> tuple[Int[np.ndarray, "*shape"], int]:
     """Label the connected components of the domain: two nodes are neighbours when they share an element.
 

@@ -1,4 +1,4 @@
-"""The heat kernel signature from eigenpairs, or without them at small times, and the influence of the boundary."""
+"""The heat kernel signature from eigenpairs, or without them at small times."""
 
 import math
 import warnings
@@ -13,13 +13,7 @@ from jaxtyping import Array, Bool, Float
 from hks_jax.accuracy import AccuracyWarning, warn_of_accuracy
 from hks_jax.arrays import nan_is_meant
 from hks_jax.checks import require_number
-from hks_jax.domain.simplicial_mesh import SimplicialMesh
-from hks_jax.domain.tensor_field import TensorField
-from hks_jax.eigen.driver import eigenpairs
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.eigen.solver import Eigensolver
-from hks_jax.fem.assembly import assemble
-from hks_jax.fem.boundary import BoundarySpec, normalise_boundary
 from hks_jax.signatures.filters import Heat
 from hks_jax.signatures.spectral_functions import spectral_diagonal, spectral_trace
 from hks_jax.signatures.times import dimension_of, measure_of, times_of
@@ -241,71 +235,3 @@ def _of_times(pairs: Eigenpairs, times: Float[Array, " n"], normalisation: str) 
     if normalisation == "flat":
         return (4 * math.pi * times) ** (dimension_of(pairs, 'normalisation="flat"') / 2)
     raise ValueError(f'normalisation: got {normalisation!r}; expected "raw", "heat-trace", "volume" or "flat"')
-
-
-@nan_is_meant
-def boundary_influence(
-    domain: TensorField | SimplicialMesh | Eigenpairs,
-    times: Any,
-    k: int | None = None,
-    boundary: BoundarySpec = "neumann",
-    solver: str | Eigensolver = "auto",
-) -> Float[Array, "n_times *shape"]:
-    """Return the share of the heat kernel signature that is due to the boundary, (k_N − k_D)/(k_N + k_D).
-
-    Here k_N ≥ k_D are the signatures with Neumann and with Dirichlet conditions on the whole boundary, including the
-    rim of a mask. The share is 1 on the boundary, 0 where the boundary has no effect yet at the time t, and NaN outside
-    the mask. At a distance d from a straight side of a flat domain the share is exp(−d²/t).
-
-    The result is differentiable with respect to the tensors. The eigenpairs of a Neumann and of a Dirichlet problem are
-    computed, which together are the eigenpairs with the boundary ``"mean"`` and the signature (k_N + k_D)/2.
-
-    Args:
-        domain: a metric in 2D or 3D, a mesh, or eigenpairs that were computed with the boundary ``"mean"``.
-        times: (n_times,) positive, in (metric length)².
-        k: the number of eigenpairs of each of the two problems. Omit k if `domain` is given as eigenpairs.
-        boundary: ``"neumann"`` or ``"mean"``, which are equivalent here. Grids also accept ``"periodic"``, as one value
-            for all axes or one per axis. Omit `boundary` if `domain` is given as eigenpairs.
-        solver: the same as for `eigenpairs`.
-
-    Raises:
-        ValueError: if the boundary is invalid, if no node or every node lies on it, or as in `eigenpairs` and `hks`.
-
-    Warns:
-        AccuracyWarning: as in `eigenpairs` and `hks`.
-
-    Examples:
-        >>> influence = hj.boundary_influence(field, [0.2], k=12)[0]
-        >>> print(influence[0, 0], influence[4, 4] < 1)
-        1.0 True
-    """
-    if isinstance(domain, Eigenpairs):
-        if k is not None or boundary != "neumann":
-            raise ValueError("k, boundary: eigenpairs already determine both; omit these arguments")
-        if len(domain.pencil.parts) != 2:
-            raise ValueError('domain: got eigenpairs of another boundary; compute them with boundary="mean"')
-        times = resolved_times(domain, times)
-        free, zero = (spectral_diagonal(domain.of_part(i), Heat(times)) for i in range(2))
-    else:
-        if k is None:
-            raise ValueError("k: got None; expected the number of eigenpairs to compute for each of the two problems")
-        pencil = assemble(domain, _glued(domain, boundary))
-        pairs = (eigenpairs(part, k, solver=solver, multiplet="complete") for part in pencil.parts)
-        free, zero = (hks(each, times) for each in pairs)
-    # Rounding of nearly equal signatures, or truncation of small signatures, may move the ratio out of [0, 1].
-    return jnp.clip((free - zero) / (free + zero), 0, 1)
-
-
-def _glued(domain: TensorField | SimplicialMesh, boundary: BoundarySpec) -> BoundarySpec:
-    """Return the boundary conditions with "mean" on every side that is not periodic."""
-    if not isinstance(domain, TensorField):
-        if boundary not in ("neumann", "mean"):
-            raise ValueError(f'boundary: got {boundary!r}; expected "neumann" for a mesh')
-        return "mean"
-    sides = normalise_boundary(boundary, domain.grid.dimension)
-    if not {condition for pair in sides for condition in pair} <= {"neumann", "mean", "periodic"}:
-        raise ValueError(
-            f'boundary: got {boundary!r}; expected "neumann" or "periodic" for each axis. Neumann and Dirichlet '
-            "conditions are compared on all sides that are not periodic"
-        )
-    return tuple("periodic" if pair == ("periodic", "periodic") else "mean" for pair in sides)

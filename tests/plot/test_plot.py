@@ -487,7 +487,7 @@ def test_pictures_of_a_signature_name_it_and_the_distance_of_diffusion(normalisa
     report = {"settings": {"metric": "inverse", "normalisation": normalisation}}
     values = np.stack([np.linspace(0.9, 1.1, 30).reshape(6, 5)] * 2)
     figure = signature_panels(Result(place, values, np.array([2.0, 8.0]), report=report))
-    assert figure.get_suptitle() == f"{title}, metric D⁻¹"
+    assert figure.get_suptitle() == f"{title}, metric D⁻¹\nD = 2 mm²/s, the median mean diffusivity"
     titles = [ax.get_title() for ax in figure.axes]
     assert titles == ["$t$ = 2 s\n$\\sqrt{Dt}$ = 2 mm", "$t$ = 8 s\n$\\sqrt{Dt}$ = 4 mm"]
 

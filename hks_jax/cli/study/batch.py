@@ -25,7 +25,7 @@ If a subject fails, the others are still computed. If the command is repeated, i
 tables that are missing, or whose input files have changed. A repeated command takes omitted options from the study.
 
 examples:
-  hks-jax batch subjects.tsv -o study --metric inverse --normalisation flat --atlas atlas.nii.gz
+  hks-jax batch subjects.tsv -o study --metric inverse --atlas atlas.nii.gz
   hks-jax batch subjects.tsv -o study --metric inverse --times 8e5 1.6e6 3.2e6 --only sub-07 sub-08
 """
 
@@ -36,7 +36,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -55,6 +55,7 @@ from hks_jax.io import TensorVolume
 from hks_jax.io.result import tuples
 from hks_jax.io.tables import read_json
 from hks_jax.io.units import LIVING_TISSUE
+from hks_jax.signatures.spans import SHORTEST
 from hks_jax.signatures.times import LAST
 
 KEPT = f"""
@@ -71,7 +72,7 @@ OPTIONS = f"""
 subjects SUBJECTS  the table of subjects
 -o,--output DIR!  the study's folder
 {KEPT}
-@atlas @names @view
+@atlas @names @view @rim
 --save-pairs
     save the eigenpairs of each subject, which other --times, --normalisation or --method then reuse
 --replace  replace a study in DIR that has other settings or times
@@ -246,8 +247,18 @@ def _suitable(
     return times
 
 
-Range = tuple[float, float]
-"""A subject's least time (by voxel size and number of eigenpairs) and largest time (by the domain's size)."""
+class Range(NamedTuple):
+    """The times that suit a subject.
+
+    Attributes:
+        least: the least time by the voxel size and the number of eigenpairs.
+        free: the time at which half of the voxels are free of the boundary.
+        largest: the largest time by the domain's size, at which λ₁t is `LAST`.
+    """
+
+    least: float
+    free: float
+    largest: float
 
 
 def suitable_range(volume: TensorVolume, args: argparse.Namespace) -> Range:
@@ -255,25 +266,27 @@ def suitable_range(volume: TensorVolume, args: argparse.Namespace) -> Range:
     metric = "inverse" if args.operator == "fick" else args.metric or "tensor"
     of: dict[str, Any] = describe(args.file, volume, args.boundary)["suits"][metric]
     by_pairs = of["least_time_of_k"] * (1.0 if args.k is None else of["k"] / args.k) ** (2 / volume.dimension)
-    return max(of["least_time"], by_pairs), of["largest_time"]
+    return Range(max(of["least_time"], by_pairs), of["largest_time"], of["time_by_size"])
 
 
 def common_times(ranges: Mapping[str, Range], n: int, unit: str) -> tuple[float, ...]:
-    """Return n log-spaced times in the intersection of all subjects' ranges, rounded to three digits.
+    """Return n log-spaced times, rounded to three digits, from the first time that is resolved for all subjects.
 
-    For the unit ``"lambda1"``, the function returns products λ₁t; the largest product is `LAST`.
+    The last time is the least time at which half of a subject's voxels are free of the boundary, but at least twice the
+    first time. For the unit ``"lambda1"``, the function returns products λ₁t.
     """
     if unit == "lambda1":
-        ranges = {name: (LAST * least / most, LAST) for name, (least, most) in ranges.items()}
-    late, small = max(ranges, key=lambda s: ranges[s][0]), min(ranges, key=lambda s: ranges[s][1])
-    least, largest = ranges[late][0], ranges[small][1]
+        ranges = {name: Range(*(LAST * t / one.largest for t in one)) for name, one in ranges.items()}
+    late, small = max(ranges, key=lambda s: ranges[s].least), min(ranges, key=lambda s: ranges[s].largest)
+    least, largest = ranges[late].least, ranges[small].largest
     if least >= largest:
         raise ValueError(
             f"--times: no time suits all subjects: {late} resolves only t ≥ {least:.3g}, and the size of {small} "
             f"allows only t ≤ {largest:.3g}. Choose times, or more eigenpairs (-k). See 'hks-jax info' for {late}: "
             "tensors with eigenvalues near zero need many eigenpairs (--repair nearest:1e-4)"
         )
-    return tuple(float(f"{t:.3g}") for t in np.geomspace(least, largest, n))
+    end = min(largest, max(min(one.free for one in ranges.values()), SHORTEST * least))
+    return tuple(float(f"{t:.3g}") for t in np.geomspace(least, end, n))
 
 
 def _only(subjects: list[Subject], names: list[str] | None) -> list[Subject]:

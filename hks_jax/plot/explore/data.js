@@ -21,6 +21,7 @@ const inside = bytes("inside");
 const values = floats("values"); // for each time, at the inside nodes in the order of the grid
 const deviations = about.noise ? floats("deviation") : null; // the standard deviations of the values due to noise
 const scores = about.fades ? floats("z") : null; // distances from the values of constant tensors, as normal numbers
+const near = about.rim === null ? null : bytes("near"); // whether the boundary contributes over a tenth
 const layers = about.layers.map((layer, i) => ({ ...layer, values: floats(`layer-${i}`) }));
 const labels = about.labels.length ? integers("labels") : null;
 
@@ -44,7 +45,16 @@ function placeAt(node) {
 }
 
 // The indices of a node in the volume, or the number of a vertex in the mesh; the page has only vertices inside.
-const voxel = (place) => (surface ? [surface.numbers[place[0]]] : about.offset.map((o, a) => o + place[a]));
+function voxel(place) {
+  if (surface) return [surface.numbers[place[0]]];
+  const shown = about.offset.map((o, a) => o + place[a]);
+  if (!about.axes) return shown;
+  const { shown: axes, first, step } = about.axes;
+  return axes.map((axis, a) => first[a] + step[a] * shown[axis]);
+}
+
+// The axis of the volume that an axis of the page shows.
+const axisOfVolume = (axis) => (about.axes && axis < dimension ? about.axes.shown.indexOf(axis) : axis);
 
 function position(place) {
   if (surface) return [...surface.vertices.subarray(3 * place[0], 3 * place[0] + 3)];
