@@ -9,11 +9,12 @@ from jaxtyping import Bool, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from hks_jax.checks import require_real
+from hks_jax.checks import require_real, require_static
 
 
 def as_mask(name: str, values: Any) -> Bool[np.ndarray, "*shape"]:
     """Return a mask of zeros and ones as booleans; raise ValueError for other values."""
+    require_static(name, values)
     require_real(name, values)
     array = np.asarray(values)
     if array.dtype != bool and not np.isin(array, (0, 1)).all():

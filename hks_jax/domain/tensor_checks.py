@@ -79,7 +79,9 @@ def require_spd(
     Messages call the location of a tensor by the word `place`: ``"node"`` on grids, ``"vertex"`` or others on meshes.
     """
     require_finite_symmetric(name, tensors, inside, place)
-    bad = inside & ~spd.is_spd(tensors)
+    size = np.abs(tensors).max(axis=(-2, -1))
+    scaled = tensors / np.where(size > 0, size, 1)[..., None, None]
+    bad = inside & ~spd.is_spd(scaled)
     if bad.any():
         what = f"not positive definite, worst eigenvalue {least_eigenvalue(tensors[bad]):.3g}"
         of_grids = f"{_MASK}, or raise their eigenvalues (hks_jax.io.repair_tensors)"
@@ -89,6 +91,14 @@ def require_spd(
                 f"metric by hks_jax.TensorField.from_indefinite. {_MASK}, if they are outside the domain"
             )
         refuse(name, bad, inside, place, what, of_grids if place == "node" else "Raise their eigenvalues")
+    # The determinant is computed in the dtype of the tensors, where it may underflow to 0 or overflow.
+    d, limits = tensors.shape[-1], np.finfo(tensors.dtype if tensors.dtype.kind == "f" else np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):  # outside the mask
+        digits = np.log10(spd.determinant(scaled.astype(np.float64))) + d * np.log10(size.astype(np.float64))
+    bad = inside & ~((digits > np.log10(limits.tiny)) & (digits < np.log10(limits.max)))
+    if bad.any():
+        what = f"so small or large that their determinant, about 1e{digits[bad][0]:.0f}, is not a {limits.dtype} number"
+        refuse(name, bad, inside, place, what, "Use another unit, in which the eigenvalues are near 1")
 
 
 def require_finite_symmetric(
@@ -204,7 +214,7 @@ def positive_map(
             )
     symmetric = spd.symmetrise(spd.identity_outside(tensors, inside))
     number = jnp.asarray(number, tensors.dtype)
-    eye = jnp.eye(tensors.shape[-1], dtype=tensors.dtype)
+    eye = jnp.broadcast_to(jnp.eye(tensors.shape[-1], dtype=tensors.dtype), tensors.shape)
     mapped = spd.exp(symmetric / number) if how == "exp" else symmetric + number * eye
     if known and not spd.is_spd(np.asarray(mapped)[inside]).all():
         raise ValueError(

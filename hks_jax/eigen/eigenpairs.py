@@ -25,7 +25,7 @@ _SAMPLE = 20_000
 class RESULTS(eqx.Enumeration):
     """The outcome of a computation of eigenpairs: a traceable code like those of lineax and optimistix."""
 
-    successful = ""
+    successful = "All eigenpairs converged, and the solver confirmed that it missed none."
     not_finite = "The matrices are not finite: tensors are NaN, infinite or not positive definite."
     unconverged = (
         "Some eigenpairs did not converge (see `.converged`), or were not found and are NaN. Use float64, fewer pairs, "

@@ -54,11 +54,14 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
         )
     if k + extra > solver.max_pairs(n_dof) and pencil.null_space is None:
         solver = Dense(solver.tolerance)
-    elif k + extra > solver.max_pairs(n_dof):
+    elif k + extra > (most := solver.max_pairs(n_dof)):
+        if most < 2:
+            raise ValueError(
+                f"solver: got {solver.name!r} for {n_dof} unknowns, which are too few for it. Use the dense solver"
+            )
         raise ValueError(
             f"k: got {k}, for which {k + extra} pairs are needed (one more shows where the spectrum is cut); the "
-            f"{solver.name} solver computes at most {solver.max_pairs(n_dof)} of {n_dof} pairs. Use a smaller k "
-            "or the dense solver"
+            f"{solver.name} solver computes at most {most} of {n_dof} pairs. Use a smaller k or the dense solver"
         )
     from_bound = pencil.null_space is None and not solver.indefinite
     if not from_bound and (not isinstance(solver, BlockLanczos) or known_by_weyl(pencil)):

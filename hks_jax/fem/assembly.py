@@ -163,7 +163,7 @@ def assemble(
     pencils = [pencil_on(held, each, operator) for each in spaces]
     if midpoints is not None and not is_traced(pencils) and np.isnan(pencils[0].mass.diagonal()).any():
         raise ValueError("midpoints: got positions that fold or invert cells; move them closer to the straight edges")
-    return _joined(pencils, operator)
+    return _joined(pencils, operator, "mirror" in str(boundary))
 
 
 def _checked_operator(
@@ -199,7 +199,7 @@ def _checked_operator(
     return WeakForm(stiffness or laplace_beltrami, of_mass, mass == "lumped", components, own), given | named
 
 
-def _joined(pencils: list[Pencil], operator: WeakForm) -> AnyPencil:
+def _joined(pencils: list[Pencil], operator: WeakForm, mirrored: bool) -> AnyPencil:
     """Return the pencil, or the `MirrorPencil` of a doubled domain; check that the user's forms are symmetric."""
     if operator.own and operator.checked:
         for name in ("stiffness", "mass"):
@@ -209,6 +209,11 @@ def _joined(pencils: list[Pencil], operator: WeakForm) -> AnyPencil:
     if len(pencils) == 1:
         return pencils[0]
     if pencils[0].space.n_dof == pencils[-1].space.n_dof:
+        if mirrored:
+            raise ValueError(
+                'boundary: got "mirror", but the mask reaches no side of the grid, where the mirrors are. Pass "mean" '
+                "for the rim of the mask"
+            )
         raise ValueError('boundary: got "mean", but the domain has no rim; pass "neumann"')
     free = [pencil.space.free for pencil in pencils]
     including = (tuple(j for j in range(i + 1) if not (own & ~free[j]).any()) for i, own in enumerate(free))

@@ -156,7 +156,7 @@ hourglass modes (alternating nodal values) have no energy."""
 # The mass makes nodal values of functions of norm 1 too large by the factor 1 + Σ μθₐ²/2, which `Pencil.read` corrects.
 def stiffness_point(metric: Float[Array, "d d"], spacing: Float[np.ndarray | Array, " d"]) -> Float[Array, ""]:
     """Return ξ² for the quadrature points ±ξ of the stiffness in a cell with this metric."""
-    s = metric * spacing[:, None] * spacing
+    s = metric * spacing[:, None] * spacing[None]
     d = len(s)
     s = d * s / jnp.trace(s)
     a = spd.adjugate(s)

@@ -78,7 +78,10 @@ def _points_from(
 ) -> Float[Array, "*elements q d"]:
     low = jnp.moveaxis(jnp.indices(elements.shape), 0, -1).astype(first.dtype)
     low = jnp.where(elements[..., None], low, first)
-    return jnp.asarray(origin + spacing * (low[..., None, :] + inner))
+    inner, origin, spacing = (
+        jnp.reshape(x, (1,) * elements.ndim + (-1, low.shape[-1])) for x in (inner, origin, spacing)
+    )
+    return origin + spacing * (low[..., None, :] + inner)
 
 
 def _numpy_rule(args: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:

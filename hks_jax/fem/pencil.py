@@ -239,7 +239,7 @@ def _constants(space: FunctionSpace, values: Array) -> NullSpace:
         vectors = numbers.ones((n_null, space.n_dof), values.dtype)
     else:
         number = numbers.arange(n_null, dtype=np.int32)[:, None]
-        vectors = (numbers.asarray(labels, np.int32) == number).astype(values.dtype)
+        vectors = (numbers.asarray(labels, np.int32)[None] == number).astype(values.dtype)
     return NullSpace(jax_array(vectors), fixed=True)
 
 

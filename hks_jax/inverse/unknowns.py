@@ -108,7 +108,7 @@ def _rotation(vector: Float[Array, "n 3"]) -> Tensors:
     o = jnp.zeros_like(x)
     cross = jnp.stack([jnp.stack(row, axis=-1) for row in ((o, -z, y), (z, o, -x), (-y, x, o))], axis=-2)
     square_of_cross = jnp.matmul(cross, cross, precision="highest")
-    return jnp.eye(3, dtype=vector.dtype) + sinc[:, None, None] * cross + versine[:, None, None] * square_of_cross
+    return jnp.eye(3, dtype=vector.dtype)[None] + sinc[:, None, None] * cross + versine[:, None, None] * square_of_cross
 
 
 def _zeros(counts: tuple[int, int], base: Tensors) -> Parameters:

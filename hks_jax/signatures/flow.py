@@ -10,6 +10,7 @@ import scipy
 from jaxtyping import Array, Float
 
 from hks_jax.accuracy import warn_of_accuracy
+from hks_jax.arrays import nan_is_meant
 from hks_jax.checks import checked_times, real_array, require_real
 from hks_jax.domain.tensor_field import TensorField, require_field
 from hks_jax.eigen.eigenpairs import Eigenpairs
@@ -20,6 +21,7 @@ from hks_jax.signatures.truncation import TAIL_LIMIT
 from hks_jax.traced import is_traced
 
 
+@nan_is_meant
 def heat_flow(pairs: Eigenpairs, times: Any, functions: Any) -> Float[Array, "n_times *functions_and_shape"]:
     """Let functions diffuse on the domain: u(t) = Σᵢ exp(−λᵢt) φᵢ ∫φᵢu, the solution of ∂u/∂t = −Δu.
 

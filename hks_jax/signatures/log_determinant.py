@@ -173,8 +173,8 @@ def log_determinant(
 def _at(pairs: Eigenpairs, a: Float[Array, " m"], d: int, times: Float[Array, "*n"]) -> Float[Array, "*n"]:
     positive = pairs.kept & (pairs.eigenvalues > 0)
     known = jnp.where(positive, pairs.eigenvalues, 1)
-    at = times[..., None]
-    tails = jnp.sum(jnp.where(positive, exponential_integral(known * at), 0), axis=-1)
+    terms = jax.vmap(lambda value: exponential_integral(value * times), out_axes=-1)(known)
+    tails = jnp.sum(jnp.where(positive, terms, 0), axis=-1)
     null = jnp.sum(pairs.kept & (pairs.eigenvalues == 0), dtype=a.dtype)
     powers = (np.arange(a.size) - d) / 2
     terms = sum(a[j] * times**p / p for j, p in enumerate(powers) if p != 0)

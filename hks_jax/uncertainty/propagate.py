@@ -16,6 +16,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from hks_jax.accuracy import AccuracyWarning, warn_of_accuracy
+from hks_jax.arrays import nan_is_meant
 from hks_jax.checks import real_array, require_count, require_number
 from hks_jax.domain import spd
 from hks_jax.storage import load_npz, write_npz
@@ -77,6 +78,7 @@ def _parts(maps: list[Any], value: Any) -> tuple[Any, Any]:
     )
 
 
+@nan_is_meant
 def uncertainty(
     function: Callable[[Array], Any],
     tensors: Any,

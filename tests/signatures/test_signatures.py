@@ -373,7 +373,7 @@ def test_too_small_times_are_reported():
         ([0.1, 0.0], "times: got 0.0; expected positive finite"),
         ([-1.0], "times: got -1.0"),
         ([np.nan], "times: got nan"),
-        (0.1, r"times: got shape \(\); expected a non-empty 1-D array; pass a single time as \[t\]"),
+        ([[0.1]], r"times: got shape \(1, 1\); expected a number or a non-empty 1-D array"),
         ([], "times: got shape"),
     ],
 )
