@@ -22,9 +22,9 @@ from hks_jax.curvature.jet import (
     nodal_jet,
     nodal_series,
     over_nodes,
-    wraps_per_axis,
 )
 from hks_jax.curvature.noise import warn_of_noise
+from hks_jax.domain.components import wraps_per_axis
 from hks_jax.domain.tensor_field import TensorField, require_field
 from hks_jax.traced import is_traced
 

@@ -19,10 +19,10 @@ from hks_jax.curvature.jet import (
     inner,
     metric_jet,
     nodal_jet,
-    wraps_per_axis,
 )
 from hks_jax.curvature.noise import warn_of_noise
 from hks_jax.domain import spd
+from hks_jax.domain.components import wraps_per_axis
 from hks_jax.domain.tensor_field import TensorField, require_field
 
 

@@ -1,7 +1,7 @@
 """Quantities and their first and second derivatives: of functions by JAX, of nodal values by finite differences."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -159,11 +159,3 @@ def over_nodes(fn: Callable[[Array], Any], values: Float[Array, "*shape_and_more
     batches = jnp.resize(flat, (n_batches, -(-size // n_batches), *flat.shape[1:]))
     found = jax.lax.map(jax.vmap(fn), batches)
     return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:size].reshape(*shape, *a.shape[2:]), found)
-
-
-def wraps_per_axis(periodic: bool | Sequence[bool], dimension: int) -> tuple[bool, ...]:
-    """Return which axes are periodic; raise ValueError unless the argument is a bool or one bool per axis."""
-    wraps = (periodic,) * dimension if isinstance(periodic, bool | np.bool_) else tuple(np.atleast_1d(periodic))
-    if len(wraps) != dimension or not all(isinstance(wrap, bool | np.bool_) for wrap in wraps):
-        raise ValueError(f"periodic: got {periodic!r}; expected True, False, or a tuple of {dimension}, one per axis")
-    return tuple(bool(wrap) for wrap in wraps)

@@ -138,6 +138,23 @@ def test_curvature_that_is_noise_is_told():
     jax.jit(hj.gaussian_curvature)(noisy(hj.Grid((40, 40)), 0.05))
 
 
+@pytest.mark.slow
+def test_error_bars_of_curvature_contain_the_truth():
+    grid = hj.Grid((30, 30), 0.05)
+    x, y = np.moveaxis(grid.nodes, -1, 0)
+    exact = np.exp(0.4 * np.sin(3 * x) * np.cos(2 * y))[..., None, None] * np.eye(2)
+    noise = hj.TensorNoise.relative(exact, 0.01, grid)
+
+    def curvature(tensors):
+        return hj.gaussian_curvature(hj.TensorField(grid, hj.smooth_tensors(grid, tensors, 0.1)))[None]
+
+    measured = exact + noise.tensors(jax.random.normal(jax.random.key(0), noise.white_shape))
+    bars = hj.uncertainty(curvature, measured, noise, draws=32)
+    z = np.abs(curvature(measured) - curvature(exact)) / bars.deviation
+    assert np.mean(z < 1) == pytest.approx(0.68, abs=0.08)
+    assert np.mean(z < 2) == pytest.approx(0.95, abs=0.04)
+
+
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_no_smooth_field_is_called_noise(dtype):
     fields = [examples.sphere_field(n, 1.0) for n in (9, 40)]
