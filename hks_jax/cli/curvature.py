@@ -59,7 +59,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         curvature = np.asarray(gaussian_curvature(field, ["x" in periodic, "y" in periodic]))
     known = np.isfinite(curvature)
     if not known.any():
-        raise ValueError("tensors: finite differences need a grid line with 8 nodes inside the mask; got none")
+        raise ValueError("tensors: finite differences need a grid line with 7 nodes inside the mask; got none")
     if lacking := int((inside & ~known).sum()):
         progress.note(f"the curvature is NaN at {lacking} nodes that are too near the mask's boundary")
     density = np.sqrt(np.linalg.det(np.asarray(field.domain_tensors, np.float64)))[known]

@@ -1,5 +1,6 @@
 """The elements of a masked grid, and their connected components."""
 
+from collections.abc import Sequence
 from itertools import product
 from typing import Any
 
@@ -23,6 +24,14 @@ def as_mask(name: str, values: Any) -> Bool[np.ndarray, "*shape"]:
             "example mask > 0.5"
         )
     return array.astype(bool)
+
+
+def wraps_per_axis(periodic: bool | Sequence[bool], dimension: int) -> tuple[bool, ...]:
+    """Return which axes are periodic; raise ValueError unless the argument is a bool or one bool per axis."""
+    wraps = (periodic,) * dimension if isinstance(periodic, bool | np.bool_) else tuple(np.atleast_1d(periodic))
+    if len(wraps) != dimension or not all(isinstance(wrap, bool | np.bool_) for wrap in wraps):
+        raise ValueError(f"periodic: got {periodic!r}; expected True, False, or a tuple of {dimension}, one per axis")
+    return tuple(bool(wrap) for wrap in wraps)
 
 
 def wrap_nodes(nodes: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
