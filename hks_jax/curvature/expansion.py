@@ -24,7 +24,6 @@ from hks_jax.curvature.jet import (
     over_nodes,
 )
 from hks_jax.curvature.noise import warn_of_noise
-from hks_jax.domain import spd
 from hks_jax.domain.components import wraps_per_axis
 from hks_jax.domain.tensor_field import TensorField, require_field, require_laplace_beltrami
 from hks_jax.traced import is_traced
