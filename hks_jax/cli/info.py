@@ -24,7 +24,7 @@ import numpy as np
 from hks_jax.cli.options import READING, as_options
 from hks_jax.cli.pairs import arrays_in
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import read
+from hks_jax.cli.reading import outside_note, read, without_element
 from hks_jax.domain.components import label_nodes
 from hks_jax.domain.simplices import WORDS, signed_measure
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
@@ -98,7 +98,7 @@ def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = N
         "inside": int(inside.sum()),
         "masked": volume.mask is not None,
         "components": count,
-        "without_element": int((inside & (labels == 0)).sum()),
+        "without_element": int(without_element(volume).sum()),
         "boundary": boundary,
         "component_sizes": np.sort(np.bincount(labels.ravel())[1:])[::-1][:10].tolist(),
         "not_positive_definite": not_positive,
@@ -172,10 +172,7 @@ def _lines(description: dict[str, Any]) -> list[str]:
             f"{', with k eigenpairs for two problems together' * (description['boundary'] == 'mean')}",
         ]
         if description["without_element"]:
-            lines.append(
-                f"                {description['without_element']} voxels of the mask are left out, because they "
-                "belong to no element; an element is a cube (in a slice a square) of adjacent voxels of the mask"
-            )
+            lines.append(f"                {outside_note(description['without_element'])}")
         lines.append(f"invalid         {bad} tensors are not positive definite")
         if "question" in description:
             lines.append(f"                {as_options(description['question'])}")

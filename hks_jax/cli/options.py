@@ -242,6 +242,15 @@ def flag(name: str) -> str:
     return ("-" if len(name) == 1 else "--") + name.replace("_", "-")
 
 
+_REMEDIES = {
+    "clean=True repairs some defects: see read_mesh": "--clean repairs some defects",
+    "Read surfaces with in_space=True, use a larger mask, or leave these points out": (
+        "Pass a larger --mask, or pass --inside with the vertices inside the mask, to leave these points out"
+    ),
+}
+"""Remedies in the library's messages, and their forms with options."""
+
+
 def as_options(message: str, names: Iterable[str] = SPELLED) -> str:
     """Return a message of the library with the named arguments replaced by options of the command line.
 
@@ -255,7 +264,9 @@ def as_options(message: str, names: Iterable[str] = SPELLED) -> str:
         message = re.sub(argument, rf"\1 {flag(name)}", message)
     for name, option in (("iterations", "--erode"), ("level", "--noise")):
         message = re.sub(rf"^{name}: ", f"{option}: ", message)
-    return message.replace("clean=True repairs some defects: see read_mesh", "--clean repairs some defects")
+    for words, options in _REMEDIES.items():
+        message = message.replace(words, options)
+    return message
 
 
 FILES = [o.name for o in options_in("@voxels @dwi @atlas @names") if o.settings.get("type") is Path]
