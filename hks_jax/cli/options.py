@@ -48,7 +48,7 @@ file FILE...
 --unit UNIT
     unit of the tensors, which are converted to mm2/s. Water in living tissue has about 7e-4 mm2/s, which is 0.7 um2/ms,
     700 um2/s (TORTOISE) or 7e-10 m2/s. With --bval, the b-values have the reciprocal unit
---array NAME  name of the tensors' array in an npz or VTK file with several arrays
+--array NAME  name of the tensors' array in an npz or VTK file with several arrays, or in the file of a mesh
 --spacing H...  distance between nodes, for .npy and .npz files that do not contain it
 --confidence C = 0.5  confidence above which a voxel of NRRD's masked tensors belongs to the mask
 [invalid] tensors that are not positive definite: by default, they raise an error

@@ -57,7 +57,7 @@ def load_freesurfer(path: Path, in_space: bool = False) -> Loaded:
         }
         axes = [told.get(name + b"ras", np.zeros(0)) for name in (b"x", b"y", b"z", b"c")]
         vertices = _from_own_axes(path, vertices, axes)
-    return Loaded(vertices, np.asarray(faces, np.int64), {})
+    return Loaded(vertices, np.asarray(faces, np.int64))
 
 
 def _from_own_axes(path: Path, vertices: np.ndarray, axes: list[np.ndarray]) -> np.ndarray:
@@ -97,7 +97,7 @@ def load_gifti(path: Path, in_space: bool = False) -> Loaded:
     vertices = vertices.astype(np.float64)
     if in_space:
         vertices = _in_space(path, vertices, arrays_of_kinds[0][0])
-    return Loaded(vertices, faces.astype(np.int64), {})
+    return Loaded(vertices, faces.astype(np.int64))
 
 
 def _name(array: Any) -> str:

@@ -1,5 +1,6 @@
 """Valid files in unusual variants are read, or refused by a message that names the reason and a remedy."""
 
+import base64
 import gzip
 
 import numpy as np
@@ -132,3 +133,164 @@ def test_a_surface_that_leaves_the_volume_is_told_in_options(tmp_path, capsys):
     said = capsys.readouterr().err
     assert "Pass a larger --mask, or pass --inside with the vertices inside the mask" in said
     assert "in_space" not in said
+
+
+# ------------------------------------------------------------------------------------------------------ meshes
+
+SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0.5], [0, 1, 0], [2, 0, 0], [2, 1, 0]])
+
+
+def ply(body, corners="vertex_indices", form="ascii", more=""):
+    """A header of six vertices and three faces with one colour each, and a body."""
+    return (
+        f"ply\nformat {form} 1.0\ncomment a test\nelement vertex 6\nproperty float x\nproperty float y\n"
+        f"property float z\nproperty float height\nelement face 3\nproperty list uchar int {corners}\n{more}"
+        "property uchar region\nend_header\n"
+    ).encode() + body
+
+
+POINTS = "".join(f"{x} {y} {z} {10 * x}\n" for x, y, z in SQUARE).encode()
+FACES = [[0, 1, 2, 3], [1, 4, 2], [4, 5, 2]]
+
+
+@pytest.mark.parametrize("corners", ["vertex_indices", "vertex_index"])
+@pytest.mark.parametrize("texture", [False, True])
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize("edges", [False, True])
+def test_variants_of_ply(tmp_path, corners, texture, form, edges):
+    regions, order = [7, 200, 9], ">" if "big" in form else "<"
+    if form == "ascii":
+        rows = [
+            f"{len(face)} {' '.join(map(str, face))} {'4 0 0.5 1 0.5 ' * texture}{region}\n"
+            for face, region in zip(FACES, regions, strict=True)
+        ]
+        body = POINTS + "".join(rows).encode() + b"0 1 5\n1 2 6\n" * edges
+    else:
+        body = np.column_stack([SQUARE, 10 * SQUARE[:, 0]]).astype(order + "f4").tobytes()
+        for face, region in zip(FACES, regions, strict=True):
+            body += bytes([len(face)]) + np.array(face, order + "i4").tobytes()
+            body += (b"\4" + np.array([0, 0.5, 1, 0.5], order + "f4").tobytes()) * texture + bytes([region])
+        body += (np.array([0, 1], order + "i4").tobytes() + b"\5") * edges + (b"\0" * 9) * edges
+    content = ply(body, corners, form, "property list uchar float texcoord\n" * texture)
+    of_edges = b"element edge 2\nproperty int vertex1\nproperty int vertex2\nproperty uchar kind\n" * edges
+    path = tmp_path / "m.ply"
+    path.write_bytes(content.replace(b"end_header", of_edges + b"end_header"))
+    mesh = hj.io.read_mesh(path)
+    np.testing.assert_array_equal(mesh.vertices, SQUARE)
+    np.testing.assert_array_equal(mesh.faces, [[0, 1, 2], [0, 2, 3], [1, 4, 2], [4, 5, 2]])
+    np.testing.assert_array_equal(hj.io.read_mesh_arrays(path)["height"], 10 * SQUARE[:, 0])
+    np.testing.assert_array_equal(hj.io.read_mesh_arrays(path, at="faces")["region"], [7, 7, 200, 9])
+    path.write_bytes(path.read_bytes()[:-3])
+    with pytest.raises(ValueError, match=r"m\.ply: the file is damaged or not a readable PLY mesh"):
+        hj.io.read_mesh(path)
+
+
+@pytest.mark.parametrize("suffix", ["vtu", "vtk", "msh"])
+def test_tensors_at_cells(tmp_path, suffix, capsys):
+    meshio = pytest.importorskip("meshio")
+    ball = hj.examples.ball_mesh(2)
+    x, cells = np.asarray(ball.vertices), ball.cells
+    tensors = np.eye(3) * (2 + x[cells].mean(axis=1)[:, 0])[:, None, None]
+    boundary = ("triangle", cells[:5, :3])  # as many codes write it beside the solid
+    data = {"D": [np.zeros((5, 9)), tensors.reshape(-1, 9)]}
+    path = tmp_path / f"m.{suffix}"
+    if suffix == "msh":
+        mesh = meshio.Mesh(x, [("tetra", cells)], cell_data={"D": data["D"][1:]})
+        meshio.gmsh.write(str(path), mesh, "2.2", binary=True)
+    else:
+        meshio.Mesh(x, [boundary, ("tetra", cells)], cell_data=data).write(path)
+    found = hj.io.read_mesh_arrays(path, at="cells")["D"].reshape(-1, 3, 3)
+    np.testing.assert_array_equal(found, tensors)
+    with pytest.raises(ValueError, match=r"at: got 'faces', but the places of arrays in .* are vertices, cells"):
+        hj.io.read_mesh_arrays(path, at="faces")
+    assert main(["info", str(path)]) == 0
+    assert "D at the cells, components: 9; to use its tensors, pass --array" in capsys.readouterr().out
+    command = ["hks", str(path), "-o", str(tmp_path / "out"), "-k", "5", "--times", "0.3"]
+    if suffix == "vtu":
+        assert main(command) == 0
+        assert "To use them, pass --array D" in capsys.readouterr().err
+    assert main([*command, "--array", "D", "--metric", "inverse", "-q"]) == 0
+    mesh = hj.TetMesh.from_tensors(x, cells, tensors, "inverse", at="cells")
+    with np.load(tmp_path / "out" / "hks.npz") as result:
+        np.testing.assert_allclose(result["hks"], hj.hks(hj.eigenpairs(mesh, 5), [0.3]), rtol=1e-6)
+
+
+def test_tensors_at_faces_follow_quadrilaterals_and_cleaning(tmp_path):
+    meshio = pytest.importorskip("meshio")
+    cells = [("quad", np.array([[0, 1, 2, 3]])), ("triangle", np.array([[1, 4, 2], [4, 4, 2], [4, 5, 2]]))]
+    meshio.Mesh(SQUARE, cells, cell_data={"a": [[1.0], [2.0, 3.0, 4.0]]}).write(tmp_path / "m.vtu")
+    arrays = hj.io.read_mesh_arrays(tmp_path / "m.vtu", at="faces", clean=True)
+    np.testing.assert_array_equal(arrays["a"], [1, 1, 2, 4])
+
+
+def test_six_components_in_legacy_vtk(tmp_path):
+    pytest.importorskip("meshio")
+    six = np.arange(24.0).reshape(4, 6)
+    heads = {
+        "UNSTRUCTURED_GRID": "POINTS 4 double\n0 0 0 1 0 0 0 1 0 1 1 0\nCELLS 1 5\n4 0 1 3 2\nCELL_TYPES 1\n9\n",
+        "STRUCTURED_GRID": "DIMENSIONS 2 2 1\nPOINTS 4 double\n0 0 0 1 0 0 0 1 0 1 1 0\n",
+        "RECTILINEAR_GRID": "DIMENSIONS 2 2 1\nX_COORDINATES 2 double\n0 1\nY_COORDINATES 2 double\n0 1\n"
+        "Z_COORDINATES 1 double\n0\n",
+    }
+    for kind, head in heads.items():
+        path = tmp_path / f"{kind}.vtk"
+        text = f"# vtk DataFile Version 3.0\ntest\nASCII\nDATASET {kind}\n{head}CELL_DATA 1\nTENSORS6 E float\n"
+        text += "1 2 3 0 0 0.5\nPOINT_DATA 4\nSCALARS s float 1\nLOOKUP_TABLE default\n1 2 3 4\nNORMALS n float\n"
+        text += "0 0 1 " * 4 + "\nTENSORS6 D double\n" + " ".join(map(str, six.ravel())) + "\n"
+        path.write_text(text)
+        assert len(hj.io.read_mesh(path).faces) == 2
+        arrays = hj.io.read_mesh_arrays(path)
+        np.testing.assert_array_equal(arrays["D"], six)
+        np.testing.assert_array_equal(arrays["n"], [[0, 0, 1]] * 4)
+        np.testing.assert_array_equal(hj.io.read_mesh_arrays(path, at="faces")["E"], [[1, 2, 3, 0, 0, 0.5]] * 2)
+    path.write_text(text.replace("DIMENSIONS 2 2 1", "DIMENSIONS 2 3 1"))
+    with pytest.raises(ValueError, match="the file is damaged"):
+        hj.io.read_mesh(path)
+
+
+@pytest.mark.parametrize("form", ["ascii", "base64", "raw"])
+def test_vtu_of_several_pieces(tmp_path, form):
+    pytest.importorskip("meshio")
+    solids = [hj.examples.ball_mesh(n) for n in (1, 2)]
+    parts, appended = [], b""
+
+    def array(name, values, components=1):
+        nonlocal appended
+        kind = {"f": "Float64", "i": "Int64", "u": "UInt8"}[values.dtype.kind]
+        head = f'<DataArray type="{kind}" Name="{name}" NumberOfComponents="{components}" '
+        content = np.uint32(values.nbytes).tobytes() + values.tobytes()
+        if form == "raw":
+            head += f'format="appended" offset="{len(appended)}"/>'
+            appended += content
+            return head
+        text = " ".join(map(repr, values.ravel().tolist()))
+        text = text if form == "ascii" else base64.b64encode(content).decode()
+        return f'{head} format="{"ascii" if form == "ascii" else "binary"}">\n{text}\n</DataArray>'
+
+    for i, solid in enumerate(solids):
+        x, cells = np.asarray(solid.vertices, np.float64) + 3.0 * i, np.asarray(solid.cells, np.int64)
+        n = len(cells)
+        parts.append(
+            f'<Piece NumberOfPoints="{len(x)}" NumberOfCells="{n}"><PointData>{array("x", x[:, 0])}</PointData>'
+            f"<CellData>{array('x', x[cells].mean(axis=1)[:, 0])}</CellData><Points>{array('p', x, 3)}</Points><Cells>"
+            f"{array('connectivity', cells.ravel())}{array('offsets', 4 * np.arange(1, n + 1))}"
+            f"{array('types', np.full(n, 10, np.uint8))}</Cells></Piece>"
+        )
+    content = (
+        '<VTKFile type="UnstructuredGrid" version="2.2" byte_order="LittleEndian" header_type="UInt32">'
+        f"<UnstructuredGrid>{''.join(parts)}</UnstructuredGrid>"
+    ).encode()
+    content += b'<AppendedData encoding="raw">_' + appended + b"\n</AppendedData>" if form == "raw" else b""
+    path = tmp_path / "m.vtu"
+    path.write_bytes(content + b"</VTKFile>")
+    mesh = hj.io.read_mesh(path)
+    x = np.asarray(mesh.vertices)
+    np.testing.assert_array_equal(x, np.concatenate([np.asarray(s.vertices) + 3.0 * i for i, s in enumerate(solids)]))
+    n = len(solids[0].vertices)
+    np.testing.assert_array_equal(mesh.cells, np.concatenate([solids[0].cells, solids[1].cells + n]))
+    np.testing.assert_allclose(hj.io.read_mesh_arrays(path)["x"].ravel(), x[:, 0])
+    np.testing.assert_allclose(hj.io.read_mesh_arrays(path, at="cells")["x"].ravel(), x[mesh.cells].mean(axis=1)[:, 0])
+    if form == "raw":
+        path.write_bytes(content.replace(b"header_type", b'compressor="vtkLZ4DataCompressor" header_type'))
+        with pytest.raises(ValueError, match=r"m\.vtu: the data are compressed by vtkLZ4.* with zlib compression"):
+            hj.io.read_mesh(path)
