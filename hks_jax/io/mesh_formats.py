@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.io.vtk_image import load as through_vtk
 from hks_jax.optional import optional
 from hks_jax.storage import reading
@@ -44,7 +45,10 @@ def through_meshio(path: Path) -> Loaded:
         content = path.read_bytes()
         declared = _declared(content, suffix)
         pieces = _pieces(content) if suffix == ".vtu" else []
-        read = _joined(library, content, pieces) if len(pieces) > 1 else _read(library, content, suffix)
+        if suffix == ".msh":
+            read = _gmsh(path, library, content)
+        else:
+            read = _joined(library, content, pieces) if len(pieces) > 1 else _read(library, content, suffix)
         _compare(content, suffix, declared, read)
         points = np.asarray(read.points, np.float64)
         blocks = [block.data for block in read.cells if block.type == "tetra"]
@@ -85,6 +89,26 @@ def _read(library: Any, content: bytes, suffix: str) -> Any:
         file.write_bytes(content)
         # The reader of the format is called, because meshio.read ends the process if it cannot read a file.
         return getattr(library, "gmsh" if suffix == ".msh" else suffix[1:]).read(str(file))
+
+
+def _gmsh(path: Path, library: Any, content: bytes) -> Any:
+    """Read a Gmsh file; without its arrays at cells, with a warning, if meshio cannot read them.
+
+    meshio 5.3 cannot read arrays at the cells of several kinds, or at some of the cells.
+    """
+    try:
+        return _read(library, content, ".msh")
+    except (Exception, SystemExit):
+        bare = re.sub(rb"^\$ElementData\b.*?^\$EndElementData\b", b"", content, flags=re.DOTALL | re.MULTILINE)
+        if bare == content:
+            raise
+        read = _read(library, bare, ".msh")
+    warn_of_accuracy(
+        f"{path}: the arrays at the cells ($ElementData) are not read, because meshio reads them only for cells of one "
+        "kind with values at every cell. To use them, write the mesh as .vtu",
+        UserWarning,
+    )
+    return read
 
 
 _ATTRIBUTE = re.compile(rb"^(TENSORS6|NORMALS)[ \t]+(\S+)[ \t]+(\w+)[ \t]*\r?\n", re.MULTILINE | re.IGNORECASE)

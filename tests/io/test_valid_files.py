@@ -215,6 +215,16 @@ def test_tensors_at_cells(tmp_path, suffix, capsys):
         np.testing.assert_allclose(result["hks"], hj.hks(hj.eigenpairs(mesh, 5), [0.3]), rtol=1e-6)
 
 
+def test_a_gmsh_file_whose_arrays_at_cells_meshio_cannot_read_is_read_without_them(tmp_path):
+    meshio = pytest.importorskip("meshio")
+    points = SQUARE[[0, 1, 2, 4, 5]]
+    cells = [("triangle", np.array([[0, 1, 2]])), ("quad", np.array([[1, 3, 4, 2]]))]
+    mesh = meshio.Mesh(points, cells, cell_data={"a": [[1.0], [2.0]]})
+    meshio.gmsh.write(str(tmp_path / "m.msh"), mesh, "2.2", binary=True)
+    with pytest.warns(UserWarning, match=r"arrays at the cells \(\$ElementData\) are not read"):
+        assert len(hj.io.read_mesh(tmp_path / "m.msh").faces) == 3
+
+
 def test_tensors_at_faces_follow_quadrilaterals_and_cleaning(tmp_path):
     meshio = pytest.importorskip("meshio")
     cells = [("quad", np.array([[0, 1, 2, 3]])), ("triangle", np.array([[1, 4, 2], [4, 4, 2], [4, 5, 2]]))]
