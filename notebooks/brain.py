@@ -75,8 +75,10 @@ assert np.linalg.eigvalsh(plane.tensors[plane.mask]).min() > 0.99e-4
 # %% [markdown]
 # ## Metric, eigenpairs, times
 #
-# `metric="inverse"` is g = D⁻¹, the metric of the diffusion itself, and t is diffusion time. In the time t heat
-# spreads over the distance √(Dt). If this distance is at least two voxels, the error of the grid is a few per cent.
+# `metric="inverse"` is g = D⁻¹, in which two points are near if diffusion between them is fast, and t is a time. In
+# the time t heat spreads over the distance √(Dt). If this distance is at least two voxels, the error of the grid is a
+# few per cent. The diffusion of a substance by Fick's law has the same distances but another operator
+# (`operator="fick"`, docs/choices.md).
 
 # %%
 grid = plane.grid("largest")
@@ -93,8 +95,8 @@ assert report.tail.max() < 0.02
 assert report.resolution_bias.max() < 0.05
 
 # %% [markdown]
-# The total heat is constant. At large t it is uniformly distributed, and the signature is one over the area of the
-# slice in the metric.
+# The total heat is constant. At large t it is uniform with respect to the area of the metric, |D|^(−½) dx, and the
+# signature is one over this area of the slice.
 
 # %%
 latest = hj.hks(pairs, [40 / float(pairs.eigenvalues[1])])[0]

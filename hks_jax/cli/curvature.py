@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from hks_jax.cli.computation import Settings, describe_input, field_of
-from hks_jax.cli.options import READING
+from hks_jax.cli.options import READING, refuse
 from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read_volume
@@ -47,6 +47,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     from hks_jax.plot.signature import cropped, placed
 
     volume, settings, periodic = read_volume(args, progress), Settings.of(args), args.periodic or ""
+    refuse(args, ("operator",), "the curvature is that of a metric; pass --metric inverse for that of D⁻¹")
     if volume.dimension != 2:
         raise ValueError(
             f"--slice: got tensors on a volume of shape {volume.shape}; expected two dimensions for the Gaussian "
@@ -58,7 +59,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         curvature = np.asarray(gaussian_curvature(field, ["x" in periodic, "y" in periodic]))
     known = np.isfinite(curvature)
     if not known.any():
-        raise ValueError("tensors: finite differences need a grid line with 8 nodes inside the mask; got none")
+        raise ValueError("tensors: finite differences need a grid line with 7 nodes inside the mask; got none")
     if lacking := int((inside & ~known).sum()):
         progress.note(f"the curvature is NaN at {lacking} nodes that are too near the mask's boundary")
     density = np.sqrt(np.linalg.det(np.asarray(field.domain_tensors, np.float64)))[known]

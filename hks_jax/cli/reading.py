@@ -19,14 +19,26 @@ from hks_jax.io.units import unit_question
 
 
 def require_metric(args: argparse.Namespace, volume: TensorVolume | None = None) -> None:
-    """Raise ValueError if the file has diffusion tensors and no metric is chosen.
+    """Raise ValueError if the file has diffusion tensors and neither metric nor Fick's operator is chosen, or both.
 
     Of NumPy's files, only those with lengths in mm have diffusion tensors, which `volume` shows after the file is read.
     """
-    if args.metric is None and (format_of(args.file).image if volume is None else volume.length_unit):
+    if args.operator == "fick":
+        require_one(args)
+    elif args.metric is None and (format_of(args.file).image if volume is None else volume.length_unit):
         raise ValueError(
-            "--metric: choose the metric of the diffusion tensors D: inverse (D⁻¹, for Brownian motion with "
-            "diffusivity D), tensor (D itself) or adjugate (|D|D⁻¹)"
+            "--metric: choose the metric of the diffusion tensors D: inverse (D⁻¹, in which points are near if "
+            "diffusion is fast), tensor (D itself) or adjugate (|D|D⁻¹); or pass --operator fick (diffusion by Fick's "
+            "law)"
+        )
+
+
+def require_one(args: argparse.Namespace) -> None:
+    """Raise ValueError for a metric beside Fick's operator."""
+    if args.operator == "fick" and args.metric is not None:
+        raise ValueError(
+            f"--metric: got {args.metric} with --operator fick, whose metric is D⁻¹. Leave out --metric, or use "
+            "--operator laplace-beltrami"
         )
 
 

@@ -1,7 +1,7 @@
 """Compare eigenvalues with Weyl's law.
 
-Compute the lowest eigenvalues of the Laplace-Beltrami operator of a field of diffusion tensors. FILE is read as in
-'hks-jax hks'.
+Compute the lowest eigenvalues of the Laplace-Beltrami operator, or of Fick's operator, of a field of diffusion
+tensors. FILE is read as in 'hks-jax hks'.
 
 The command writes to the folder OUT: spectrum.csv and spectrum.npz (eigenvalues, residuals, and the counts of
 eigenvalues by Weyl's law), spectrum.png and report.json. The default boundary condition is neumann even for a mask,

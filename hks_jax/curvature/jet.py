@@ -1,8 +1,7 @@
 """Quantities and their first and second derivatives: of functions by JAX, of nodal values by finite differences."""
 
-from collections.abc import Callable, Sequence
-from functools import lru_cache
-from math import factorial
+import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -10,82 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hks_jax.curvature.stencils import NODES, differentiate
 from hks_jax.domain import spd
 from hks_jax.domain.components import active_elements, element_nodes
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_field import TensorField
-
-MINIMUM_NODES = 8
-"""The number of nodes of the widest stencil, which gives a one-sided second derivative of sixth order."""
-
-
-@lru_cache
-def stencils(order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sixth-order stencils of a first or second derivative: the centred one first, others by their shift.
-
-    Row i of the offsets (n, 8) and of the weights (n, 8) is stencil i for unit spacing, padded with zeros. For the
-    second derivative, a centred stencil of 7 nodes gains an order by symmetry; shifted stencils need 8 nodes.
-    """
-    width = 6 + order
-    centred = np.arange(-3, 4)
-    shifted = [run for s in range(-width + 1, 1) if not set(centred) <= set(run := np.arange(s, s + width))]
-    runs = [centred, *sorted(shifted, key=lambda run: abs(run.sum()))]
-    offsets = np.zeros((len(runs), MINIMUM_NODES), dtype=np.int32)
-    weights = np.zeros((len(runs), MINIMUM_NODES))
-    for row, run in enumerate(runs):
-        for column, node in enumerate(run):
-            # A node's weight is a derivative of its Lagrange polynomial at 0; the products of small integers are exact.
-            others = run[run != node]
-            offsets[row, column] = node
-            weights[row, column] = factorial(order) * np.poly(others)[-1 - order] / np.prod(node - others)
-    return offsets, weights
-
-
-def differentiate(
-    values: Float[Array, "*shape_and_components"],
-    inside: Bool[np.ndarray, "*shape"],
-    axis: int,
-    order: int,
-    spacing: float,
-    wraps: bool,
-) -> tuple[Float[Array, "*shape_and_components"], Bool[np.ndarray, "*shape"]]:
-    """Return the first or second derivative of nodal values along a grid axis, and the nodes where it is known.
-
-    Only values at nodes inside the domain are used. The derivative is 0 where no stencil lies inside the domain.
-    """
-    offsets, weights = stencils(order)
-    n, d = inside.shape[axis], inside.ndim
-    along = [n if a == axis else 1 for a in range(d)]
-    # Without a mask, all grid lines along the axis have the same stencils, which are chosen for one line.
-    choice, valid = _choose(np.ones(along, dtype=bool) if inside.all() else inside, offsets, axis, wraps)
-    expand = tuple(range(d, jnp.ndim(values)))
-    rows = np.expand_dims(choice, expand)
-    nodes = np.expand_dims(np.arange(n, dtype=np.int32).reshape(along), expand)
-    table, shifts = jnp.asarray(weights / spacing**order, values.dtype), jnp.asarray(offsets)
-    total = jnp.zeros_like(values)
-    for column in range(MINIMUM_NODES):
-        index = (nodes + shifts[rows, column]) % n
-        total += table[rows, column] * jnp.take_along_axis(values, index, axis=axis)
-    valid = np.broadcast_to(valid, inside.shape)
-    # Unknown derivatives are zero and not NaN, since 0·NaN would spoil the gradient of known derivatives.
-    return jnp.where(np.expand_dims(valid, expand), total, 0), valid
-
-
-def _choose(
-    inside: np.ndarray, offsets: np.ndarray, axis: int, wraps: bool
-) -> tuple[np.ndarray, Bool[np.ndarray, "*shape"]]:
-    """Return for each node the first stencil with all nodes inside, or 0, and whether such a stencil exists."""
-    reach = MINIMUM_NODES - 1
-    width = [(reach, reach) if a == axis else (0, 0) for a in range(inside.ndim)]
-    padded = np.pad(inside, width, mode="wrap") if wraps else np.pad(inside, width)
-    n = inside.shape[axis]
-
-    def shifted(offset: np.integer) -> np.ndarray:
-        return padded.take(np.arange(reach + offset, reach + offset + n), axis=axis)
-
-    fits = [np.logical_and.reduce([shifted(offset) for offset in run]) for run in offsets]
-    return np.argmax(fits, axis=0).astype(np.int32), np.logical_or.reduce(fits)
-
 
 _BATCH = 4096
 
@@ -121,25 +49,61 @@ def nodal_jet(
     wraps: tuple[bool, ...],
 ) -> tuple[Jet, Bool[np.ndarray, "*shape"]]:
     """Compute the jets of nodal values by finite differences; also return the nodes where all derivatives are known."""
-    if min(grid.shape) < MINIMUM_NODES:
-        raise ValueError(
-            f"grid: got shape {grid.shape}; expected at least {MINIMUM_NODES} nodes on every axis, for differences "
-            "of sixth order. Use a finer grid, or a metric from TensorField.from_function"
-        )
+    _require_nodes(grid, wraps, 2)
     d = grid.dimension
 
-    def along(values: Array, inside: np.ndarray, axis: int, order: int) -> tuple[Array, np.ndarray]:
-        return differentiate(values, inside, axis, order, grid.spacing[axis], wraps[axis])
+    def along(values: Array, inside: np.ndarray, axis: int, orders: range) -> tuple[list[Array], np.ndarray]:
+        return differentiate(values, inside, axis, orders, 2, grid.spacing[axis], wraps[axis])
 
-    first = [along(values, inside, a, 1) for a in range(d)]
-    second = [[along(*first[a], b, 1) if a < b else along(values, inside, a, 2) for b in range(a, d)] for a in range(d)]
-    known = np.logical_and.reduce([valid for row in [first, *second] for _, valid in row])
-    hessian = [[second[min(a, b)][abs(b - a)][0] for b in range(d)] for a in range(d)]
+    lines = [along(values, inside, a, range(1, 3)) for a in range(d)]
+    mixed = {(a, b): along(lines[a][0][0], lines[a][1], b, range(1, 2)) for a in range(d) for b in range(a + 1, d)}
+    known = np.logical_and.reduce([valid for _, valid in [*lines, *mixed.values()]])
+
+    def second(a: int, b: int) -> Array:
+        return lines[a][0][1] if a == b else mixed[min(a, b), max(a, b)][0][0]
+
     return Jet(
         values,
-        jnp.stack([derivative for derivative, _ in first], axis=-1),
-        jnp.stack([jnp.stack(row, axis=-1) for row in hessian], axis=-2),
+        jnp.stack([derivatives[0] for derivatives, _ in lines], axis=-1),
+        jnp.stack([jnp.stack([second(a, b) for b in range(d)], axis=-1) for a in range(d)], axis=-2),
     ), known
+
+
+def nodal_series(
+    values: Float[Array, "nx ny *components"],
+    grid: Grid,
+    inside: Bool[np.ndarray, "nx ny"],
+    wraps: tuple[bool, ...],
+    degree: int,
+) -> tuple[Float[Array, "nx ny *components n_terms"], Bool[np.ndarray, "nx ny"]]:
+    """Compute Taylor series of nodal values on a 2D grid by finite differences; also return the nodes with a series.
+
+    The coefficients have the order of `taylor`.
+    """
+    _require_nodes(grid, wraps, degree)
+
+    def along(values: Array, inside: np.ndarray, axis: int) -> tuple[Array, np.ndarray]:
+        orders = range(1, degree + 1)
+        found, known = differentiate(values, inside, axis, orders, degree, grid.spacing[axis], wraps[axis])
+        return jnp.stack([values, *found], axis=-1), known
+
+    of_x, known = along(values, inside, 0)
+    of_xy, known = along(of_x, known, 1)
+    terms = [
+        of_xy[..., k - j, j] / (math.factorial(k - j) * math.factorial(j))
+        for k in range(degree + 1)
+        for j in range(k + 1)
+    ]
+    return jnp.stack(terms, axis=-1), known
+
+
+def _require_nodes(grid: Grid, wraps: tuple[bool, ...], highest: int) -> None:
+    least = tuple(NODES[2 if wrap else highest] for wrap in wraps)
+    if any(n < needed for n, needed in zip(grid.shape, least, strict=True)):
+        raise ValueError(
+            f"grid: got shape {grid.shape}; expected at least {least} nodes, for differences of nodal values up to the "
+            f"order {highest}. Use a finer grid, or a metric from TensorField.from_function"
+        )
 
 
 def christoffel(metric: Jet) -> Float[Array, "... d d d"]:
@@ -181,17 +145,17 @@ def at_nodes(fn: Callable[[Array], Any], grid: Grid, inside: Bool[np.ndarray, "*
     Nodes outside the domain get the function's value at a node inside. The function may be NaN outside, and NaN would
     enter the gradients even if a mask removed it from the values.
     """
-    flat = np.where(inside[..., None], grid.nodes, grid.nodes[inside][0]).reshape(-1, grid.dimension)
+    nodes = np.where(inside[..., None], grid.nodes, grid.nodes[inside][0])
+    return over_nodes(fn, jnp.asarray(nodes, jnp.result_type(float)), grid.dimension)
+
+
+def over_nodes(fn: Callable[[Array], Any], values: Float[Array, "*shape_and_more"], dimension: int) -> Any:
+    """Apply a function to the values of every node of a grid; each array in the result has the shape (*shape, …)."""
+    shape = values.shape[:dimension]
     # High derivatives have many intermediates per node; batches limit their memory and keep them in the cache.
-    n_batches = -(-grid.size // _BATCH)
-    batches = np.resize(flat, (n_batches, -(-grid.size // n_batches), grid.dimension))
-    values = jax.lax.map(jax.vmap(fn), jnp.asarray(batches, jnp.result_type(float)))
-    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[: grid.size].reshape(*grid.shape, *a.shape[2:]), values)
-
-
-def wraps_per_axis(periodic: bool | Sequence[bool], dimension: int) -> tuple[bool, ...]:
-    """Return which axes are periodic; raise ValueError unless the argument is a bool or one bool per axis."""
-    wraps = (periodic,) * dimension if isinstance(periodic, bool | np.bool_) else tuple(np.atleast_1d(periodic))
-    if len(wraps) != dimension or not all(isinstance(wrap, bool | np.bool_) for wrap in wraps):
-        raise ValueError(f"periodic: got {periodic!r}; expected True, False, or a tuple of {dimension}, one per axis")
-    return tuple(bool(wrap) for wrap in wraps)
+    size = math.prod(shape)
+    n_batches = -(-size // _BATCH)
+    flat = values.reshape(size, *values.shape[dimension:])
+    batches = jnp.resize(flat, (n_batches, -(-size // n_batches), *flat.shape[1:]))
+    found = jax.lax.map(jax.vmap(fn), batches)
+    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:size].reshape(*shape, *a.shape[2:]), found)

@@ -193,7 +193,8 @@ def degenerate_points(
     ax: Axes,
     field: TensorField,
     *,
-    merge: int = 2,
+    merge: float = 2,
+    periodic: bool | Sequence[bool] = False,
     size: float = 0.022,
     cmap: str = "PuOr",
     legend: bool = True,
@@ -208,13 +209,14 @@ def degenerate_points(
         ax: the axes to draw on.
         field: the field.
         merge: the same as for `hks_jax.degenerate_points`, which computes the points.
+        periodic: the same.
         size: the radius of a mark, relative to the longer side of the grid.
         cmap: a diverging colour map; its middle belongs to index 0.
         legend: whether to add a legend with each index and the number of its points.
         **kwargs: arguments of `matplotlib.collections.PolyCollection`.
 
     Raises:
-        ValueError: if the field is 3D, `merge` is less than 1, or `size` is not positive.
+        ValueError: if the field is 3D, `merge` or `periodic` is bad, or `size` is not positive.
 
     Examples:
         >>> wedge = hj.examples.degenerate_point_field(0.5, 9)
@@ -224,7 +226,7 @@ def degenerate_points(
     """
     if not size > 0:
         raise ValueError(f"size: got {size}; expected a positive number, relative to the longer side")
-    positions, indices = find_degenerate_points(field, merge)
+    positions, indices = find_degenerate_points(field, merge, periodic)
     x0, x1, y0, y1 = cell_extent(field.grid)
     radii = np.full(len(indices), size * max(x1 - x0, y1 - y0))
     if len(indices) > 1:

@@ -98,11 +98,67 @@ def test_near_points_merge_as_asked():
     assert hj.degenerate_points(field).indices.tolist() == [0.5, 0.5]
     assert hj.degenerate_points(field, merge=6).indices.tolist() == [1.0]
     pair = field_of((z - 0.12 - 0.03j) * np.conj(z + 0.13 - 0.03j), grid)
-    assert hj.degenerate_points(pair, merge=6).indices.size == 0
+    assert sorted(hj.degenerate_points(pair, merge=6).indices) == [-0.5, 0.5]  # their sum is no point, but they are two
+
+
+@pytest.mark.parametrize(("same", "distances"), [(False, (1.0, 1.5, 2.5, 3.5)), (True, (2.5, 3.5))])
+def test_near_pairs_are_found_at_random_places_and_angles(same, distances):
+    grid, rng, trials = hj.Grid((20, 20)), np.random.default_rng(1), 40
+    for distance in distances:
+        count = 0
+        for _ in range(trials):
+            z = (plane(grid) - complex(*rng.uniform(7, 12, 2))) / 10
+            half = np.exp(1j * rng.uniform(0, 2 * np.pi)) * distance / 20
+            turned = np.exp(1j * rng.uniform(0, 2 * np.pi)) * (z - half)
+            points = hj.degenerate_points(field_of(turned * ((z + half) if same else np.conj(z + half)), grid))
+            count += sorted(points.indices) == ([0.5, 0.5] if same else [-0.5, 0.5])
+        assert count >= (trials if distance > 1 else 10)  # at a distance of one cell, both may be in the same cell
+
+
+def test_noise_is_not_one_point_and_indices_on_a_torus_add_up_to_zero():
+    grid, rng = hj.Grid((60, 60)), np.random.default_rng(0)
+    noise = field_of(rng.normal(size=grid.shape) + 1j * rng.normal(size=grid.shape), grid)
+    points = hj.degenerate_points(noise, periodic=True)
+    assert points.indices.size > 600
+    assert points.indices.sum() == 0
+    assert (points.positions >= 0).all()
+    assert (points.positions < 60).all()
+    assert hj.degenerate_points(noise, merge=0.01, periodic=True).indices.sum() == 0
+
+
+def test_periodic_fields_turn_with_the_grid():
+    n = 40
+    x, y = np.moveaxis(hj.Grid((n, n)).nodes * 2 * np.pi / n, -1, 0)
+    v = np.sin(x + 0.013) + 0.3 * np.cos(y) + 1j * np.sin(y + 0.2)
+    reference = hj.degenerate_points(field_of(v, hj.Grid((n, n))), periodic=True)
+    assert sorted(reference.indices) == [-0.5, -0.5, 0.5, 0.5]
+    for shift in ((7, 0), (0, 3), (20, 31), *((0, k) for k in range(34, 40)), *((k, 0) for k in range(16, 24))):
+        moved = hj.degenerate_points(field_of(np.roll(v, shift, axis=(0, 1)), hj.Grid((n, n))), periodic=True)
+        expected = np.mod(reference.positions + shift, n)
+        order = np.lexsort((expected[:, 1], expected[:, 0]))
+        np.testing.assert_allclose(moved.positions, expected[order], atol=1e-9)
+        np.testing.assert_array_equal(moved.indices, reference.indices[order])
+    with pytest.raises(ValueError, match="periodic: got"):
+        hj.degenerate_points(field_of(v, hj.Grid((n, n))), periodic=(True,) * 3)
+
+
+def test_a_point_of_high_index_across_periodic_sides():
+    grid = hj.Grid.from_bounds(-1, 1, (30, 30))
+    z = plane(grid)
+    for index in (-1.5, -1, 1, 1.5):
+        # Far from the point, v is constant, so that the rest of the index is in the points around.
+        near = np.abs(z) ** 2 * np.exp(2j * index * np.angle(z))
+        field = field_of(near * np.exp(-((np.abs(z) / 0.5) ** 6)) + 1e-3 * (np.exp(1j * z.real) + z.imag**2), grid)
+        reference = hj.degenerate_points(field, periodic=True)
+        rolled = hj.TensorField(grid, np.roll(field.tensors, (15, 15), axis=(0, 1)))
+        moved = hj.degenerate_points(rolled, periodic=True)
+        assert reference.indices.sum() == moved.indices.sum() == 0
+        assert sorted(reference.indices) == sorted(moved.indices)
+        assert index in moved.indices
 
 
 def test_errors():
     with pytest.raises(ValueError, match=r"field: got a grid of shape \(3, 3, 3\); expected 2 dimensions"):
         hj.degenerate_points(hj.TensorField(hj.Grid((3, 3, 3)), np.broadcast_to(np.eye(3), (3, 3, 3, 3, 3))))
-    with pytest.raises(ValueError, match="merge: got 0; expected an integer of at least 1"):
+    with pytest.raises(ValueError, match="merge: got 0; expected a finite number above 0"):
         hj.degenerate_points(hj.examples.degenerate_point_field(0.5, 9), merge=0)

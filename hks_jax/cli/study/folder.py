@@ -39,8 +39,9 @@ SUMMARY = {
     "status": "done, failed, or pending if the run did not include the subject",
     "voxels": "number of voxels in the domain",
     "k": "number of eigenpairs",
-    "lambda1": "first positive eigenvalue in 1/(metric length)²; in 1/s for the metric D⁻¹ with D in mm²/s",
+    "lambda1": "first positive eigenvalue in 1/(metric length)²; in 1/s for D in mm²/s with D⁻¹ or Fick's operator",
     "truncation": "largest share of the signature, over t, from omitted eigenpairs (estimate)",
+    "free_of_rim": "share of voxels, at the last t, at which the boundary contributes less than 10 % of the signature",
     "resolution": "largest relative error, over t, due to the size of the voxels (estimate)",
     "warnings": "number of warnings, which the subject's sidecar contains",
     "problem": "reason why the subject failed",
@@ -113,6 +114,8 @@ class Study:
             "Times": result.times.tolist(),
             "TimesByFirstEigenvalue": None if scaled is None else scaled.tolist(),
             "TimesDescription": times_text(self.time_unit),
+            "Units": report["units"],
+            "Rim": report["rim"],
             "Sources": [os.path.basename(path) for paths in tensor_files(args).values() for path in paths],
             "Input": _without_folder(report["input"]),
             "Eigenpairs": report["eigenpairs"],
@@ -208,7 +211,7 @@ def times_text(unit: str) -> str:
     """Return a description of the times of a study."""
     if unit == "lambda1":
         return "the times of each subject are the given numbers divided by its first positive eigenvalue λ₁"
-    return "all subjects have the same times, in (metric length)²; in s for the metric D⁻¹ with D in mm²/s"
+    return "all subjects have the same times, in (metric length)²; in s for D in mm²/s with D⁻¹ or Fick's operator"
 
 
 def _without_folder(about: Mapping[str, Any]) -> dict[str, Any]:
@@ -218,11 +221,12 @@ def _without_folder(about: Mapping[str, Any]) -> dict[str, Any]:
 def _summary(sidecar: Path, problem: str | None) -> tuple[Any, ...]:
     report = {} if problem is not None else read_json(sidecar)
     if not report:
-        return ("failed" if problem else "pending", *(None,) * 6, problem or None)
+        return ("failed" if problem else "pending", *(None,) * 7, problem or None)
     pairs, times = report["Eigenpairs"], report["Truncation"]
     worst = [max((t[name] or 0.0 for t in times), default=0.0) for name in ("truncation", "resolution_bias")]
     inside, warnings = report["Input"]["voxels_inside"], len(report["Warnings"])
-    return ("done", inside, pairs["k"], pairs["first_positive"], *worst, warnings, None)
+    free = times[-1].get("free_of_rim") if times else None
+    return ("done", inside, pairs["k"], pairs["first_positive"], worst[0], free, worst[1], warnings, None)
 
 
 def _digest(content: Any) -> str:

@@ -143,7 +143,8 @@ class _Task(NamedTuple):
             npz = study.path(subject, f"{MAP}.npz")
             result = Result.read(npz, "hks", over_times=True) if result is None else result
             with progress.stage("drawing"):
-                draw_picture(study.picture(subject), partial(signature_panels, result, view=subject.args.view), [npz])
+                style = {"view": subject.args.view, "show_rim": subject.args.show_rim}
+                draw_picture(study.picture(subject), partial(signature_panels, result, **style), [npz])
 
 
 def _compute(study: Study, subject: Subject, fingerprint: str, progress: StudyProgress) -> Result:

@@ -1,0 +1,109 @@
+"""A warning where the noise or the rounding of nodal tensors dominates what is computed from their derivatives."""
+
+from collections.abc import Callable, Sequence
+from math import comb
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hks_jax.accuracy import warn_of_accuracy
+from hks_jax.domain.grid import Grid
+from hks_jax.domain.tensor_field import TensorField
+from hks_jax.traced import is_traced
+
+_FLAT = 0.5
+"""The least ratio of the roughness in differences of the order n to that of the order n − 2, if noise dominates both.
+
+White noise has the same roughness in all orders; the roughness of a resolved smooth field falls with the order."""
+_NORMAL = 1.4826
+"""The ratio of the standard deviation of a normal variable with mean zero to the median of its absolute value."""
+_SHARE = 0.5
+"""The least ratio of the noise to the median size of a quantity at which noise dominates the quantity."""
+_ROUNDING = 100
+"""The noise, in machine precisions of the tensors, below which it is called rounding."""
+
+
+def warn_of_noise(
+    field: TensorField,
+    compute: Callable[[TensorField], Sequence[Array]],
+    values: Sequence[Array],
+    names: Sequence[str],
+    negligible: Sequence[float],
+    differences: int = 6,
+) -> None:
+    """Warn about the first of several quantities at the nodes that is dominated by noise of the tensors.
+
+    The noise of a quantity is the median size of its change if noise of the estimated level is added to the tensors.
+
+    Args:
+        field: the metric; nothing is done for a function, or if it is traced.
+        compute: returns the quantities of a field.
+        values: the quantities of `field`.
+        names: the names of the quantities.
+        negligible: the noise of each quantity that does not matter; at least 1/V^(2/d) counts as such for the first,
+            the curvature, since smaller curvatures change nothing in a domain of the volume V.
+        differences: the order of the differences that show the noise. It must exceed the order of the derivatives.
+    """
+    if field.function is not None or is_traced((field, list(values))):
+        return
+    tensors = np.asarray(field.domain_tensors)
+    precision, d = float(np.finfo(tensors.dtype).eps), field.grid.dimension
+    high, low = (_roughness(tensors.astype(np.float64), field.grid, n) for n in (differences, differences - 2))
+    level = max(high if high > _FLAT * low else 0.0, precision)
+    inside = field.grid.inside
+    density = np.sqrt(np.abs(np.linalg.det(tensors[inside].astype(np.float64))))
+    floor = float(np.sum(density) * np.prod(field.grid.spacing)) ** (-2 / d)
+    white = np.random.default_rng(0).normal(size=tensors.shape)
+    noise = level * (white + np.swapaxes(white, -1, -2)) / 2 * _mean(tensors)[..., None, None]
+    noisy = eqx.tree_at(lambda f: f._tensors, field, jnp.asarray(tensors + noise.astype(tensors.dtype)))
+    for name, value, other, least in zip(names, values, compute(noisy), negligible, strict=True):
+        change_at, size_at = np.abs(np.asarray(other - value, np.float64)), np.abs(np.asarray(value, np.float64))
+        known = np.isfinite(change_at)
+        if not known.any():
+            continue
+        size, change = np.median(size_at[known]), np.median(change_at[known])
+        if change <= max(least or floor, _SHARE * size):
+            continue
+        told = f"the {name} has an error of about {change:.2g} by "
+        if level < _ROUNDING * precision:
+            warn_of_accuracy(
+                f"{told}rounding of the tensors in {tensors.dtype}, and a median size of {size:.2g}: the error grows "
+                "with refinement. Use float64, a coarser grid (such as every second node), a lower order, or a metric "
+                "from TensorField.from_function"
+            )
+        else:
+            warn_of_accuracy(
+                f"{told}noise of the tensors, and a median size of {size:.2g}: noise dominates. By differences of "
+                f"nodes, the noise is {level:.2g} of the mean eigenvalue. Smooth the tensors, for example by hks_jax."
+                "smooth_tensors(grid, tensors, width) with a width of some node distances, and compute error bars with "
+                "hks_jax.uncertainty"
+            )
+        return
+
+
+def _mean(tensors: Float[np.ndarray, "*shape d d"]) -> Float[np.ndarray, "*shape"]:
+    return np.trace(tensors, axis1=-2, axis2=-1) / tensors.shape[-1]
+
+
+def _roughness(tensors: Float[np.ndarray, "*shape d d"], grid: Grid, order: int) -> float:
+    """Return the standard deviation of independent noise of the diagonal components, relative to the mean eigenvalue.
+
+    High differences remove smooth fields; their median ignores the few nodes at edges of the anatomy.
+    """
+    weights = np.array([(-1) ** k * comb(order, k) for k in range(order + 1)])
+    found = []
+    for axis, n in enumerate(grid.shape):
+        parts, mean, inside = (
+            np.moveaxis(a, axis, 0) for a in (np.diagonal(tensors, axis1=-2, axis2=-1), _mean(tensors), grid.inside)
+        )
+        rows = range(n - order)
+        if not rows:
+            continue
+        windows = [slice(k, k + len(rows)) for k in range(order + 1)]
+        difference = sum(w * parts[part] for w, part in zip(weights, windows, strict=True))
+        whole = np.logical_and.reduce([inside[part] for part in windows])
+        found.append(np.abs(difference / mean[windows[order // 2]][..., None])[whole].ravel())
+    values = np.concatenate(found) if found else np.zeros(0)
+    return _NORMAL * float(np.median(values)) / float(np.linalg.norm(weights)) if values.size else 0.0
