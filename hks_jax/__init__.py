@@ -68,7 +68,6 @@ from hks_jax.signatures.flow import gaussian_scale_space as gaussian_scale_space
 from hks_jax.signatures.flow import heat_flow as heat_flow
 from hks_jax.signatures.flow import tensor_invariants as tensor_invariants
 from hks_jax.signatures.hks import AutomaticHKS as AutomaticHKS
-from hks_jax.signatures.hks import boundary_influence as boundary_influence
 from hks_jax.signatures.hks import hks as hks
 from hks_jax.signatures.hks import hks_auto as hks_auto
 from hks_jax.signatures.kernels import heat_kernel as heat_kernel
@@ -81,8 +80,9 @@ from hks_jax.signatures.log_determinant import heat_coefficients as heat_coeffic
 from hks_jax.signatures.log_determinant import log_determinant as log_determinant
 from hks_jax.signatures.regions import RegionStatistics as RegionStatistics
 from hks_jax.signatures.regions import region_statistics as region_statistics
+from hks_jax.signatures.rim import boundary_influence as boundary_influence
+from hks_jax.signatures.spans import default_times as default_times
 from hks_jax.signatures.times import default_energies as default_energies
-from hks_jax.signatures.times import default_times as default_times
 from hks_jax.signatures.truncation import Truncation as Truncation
 from hks_jax.signatures.truncation import truncation as truncation
 from hks_jax.signatures.truncation import truncation_map as truncation_map

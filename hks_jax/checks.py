@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hks_jax.arrays import describe_array, jax_array
+from hks_jax.arrays import describe_array, jax_array, nan_outside
 from hks_jax.traced import is_traced
 
 
@@ -73,8 +73,18 @@ def _no_numbers(name: str, values: Any) -> ValueError:
     return ValueError(f"{name}: got {describe_array(values)[:200]}; expected an array of numbers{remedy}")
 
 
+def require_static(name: str, value: Any) -> None:
+    """Raise ValueError for a traced argument that decides shapes or connectivity, and so must be known beforehand."""
+    if is_traced(value):
+        raise ValueError(
+            f"{name}: got a traced value, an argument of a function under jax.jit, jax.vmap or jax.grad; expected a "
+            "static value. Take it from outside of this function, or name the argument in static_argnames of jax.jit"
+        )
+
+
 def require_count(name: str, value: Any, least: int = 1) -> None:
     """Raise ValueError unless a setting is an integer of at least ``least``."""
+    require_static(name, value)
     with suppress(TypeError):
         if operator.index(value) >= least:
             return
@@ -82,18 +92,23 @@ def require_count(name: str, value: Any, least: int = 1) -> None:
 
 
 def checked_times(times: Any, dtype: Any) -> Float[Array, " n"]:
-    """Return times as an array (n,); raise ValueError unless n ≥ 1 and the times are positive and finite."""
+    """Return times as an array (n,), one time for a number; raise ValueError unless all are positive and finite.
+
+    Traced times are NaN unless they are positive and finite.
+    """
     require_real("times", times)
     try:
         is_array = isinstance(times, jax.Array) or is_traced(times)
         array = jnp.asarray(times, dtype) if is_array else jax_array(np.asarray(times, dtype))
     except (TypeError, ValueError):
         raise ValueError(f"times: got {times!r}; expected a 1-D array of positive numbers") from None
-    if array.ndim != 1 or array.size == 0:
-        raise ValueError(f"times: got shape {array.shape}; expected a non-empty 1-D array; pass a single time as [t]")
-    if not is_traced(array):
-        values = np.asarray(array)
-        bad = ~(np.isfinite(values) & (values > 0))
-        if bad.any():
-            raise ValueError(f"times: got {values[bad][0]}; expected positive finite times")
+    if array.ndim > 1 or array.size == 0:
+        raise ValueError(f"times: got shape {array.shape}; expected a number or a non-empty 1-D array")
+    array = array.reshape(-1)
+    if is_traced(array):
+        return nan_outside(array, jnp.isfinite(array) & (array > 0))
+    values = np.asarray(array)
+    bad = ~(np.isfinite(values) & (values > 0))
+    if bad.any():
+        raise ValueError(f"times: got {values[bad][0]}; expected positive finite times")
     return array

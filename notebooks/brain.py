@@ -1,9 +1,9 @@
 # %% [markdown]
 # # A brain, from the scan to its signature
 #
-# This notebook starts from diffusion-weighted images with b-values and directions. DIPY fits the tensors. Then follow
-# the mask, a slice, the metric, the eigenpairs, the heat kernel signature at several times, pictures, and a NIfTI
-# file in the space of the scan. To use your own scan, run
+# This notebook starts from diffusion-weighted images with b-values and directions, and fits tensors. Then follow the
+# mask, a slice, the metric, the eigenpairs, the heat kernel signature at several times, pictures, and a NIfTI file in
+# the space of the scan. To use your own scan, run
 #
 #     HKS_SCAN=dwi.nii.gz HKS_SLICE=10 python notebooks/brain.py
 #
@@ -60,8 +60,8 @@ bval, bvec = (scan.with_name(stem + suffix) for suffix in (".bval", ".bvec"))
 #
 # Without a mask, DIPY's `median_otsu` finds the brain. A slice uses the in-plane block of D, so diffusion stays in
 # the slice. The rim is removed, because its voxels contain tissue and its surroundings. Noise makes some tensors
-# indefinite. DIPY clips their eigenvalues to almost zero, and D⁻¹ would be extremely large. These tensors are
-# replaced by the nearest valid tensors.
+# indefinite or nearly singular, and D⁻¹ would not exist or be extremely large. These tensors are replaced by the
+# nearest valid tensors.
 
 # %%
 volume = hj.io.fit_dwi(scan, bval, bvec, b_max=1500)
@@ -75,8 +75,10 @@ assert np.linalg.eigvalsh(plane.tensors[plane.mask]).min() > 0.99e-4
 # %% [markdown]
 # ## Metric, eigenpairs, times
 #
-# `metric="inverse"` is g = D⁻¹, the metric of the diffusion itself, and t is diffusion time. In the time t heat
-# spreads over the distance √(Dt). If this distance is at least two voxels, the error of the grid is a few per cent.
+# `metric="inverse"` is g = D⁻¹, in which two points are near if diffusion between them is fast, and t is a time. In
+# the time t heat spreads over the distance √(Dt). If this distance is at least two voxels, the error of the grid is a
+# few per cent. The diffusion of a substance by Fick's law has the same distances but another operator
+# (`operator="fick"`, docs/choices.md).
 
 # %%
 grid = plane.grid("largest")
@@ -93,8 +95,8 @@ assert report.tail.max() < 0.02
 assert report.resolution_bias.max() < 0.05
 
 # %% [markdown]
-# The total heat is constant. At large t it is uniformly distributed, and the signature is one over the area of the
-# slice in the metric.
+# The total heat is constant. At large t it is uniform with respect to the area of the metric, |D|^(−½) dx, and the
+# signature is one over this area of the slice.
 
 # %%
 latest = hj.hks(pairs, [40 / float(pairs.eigenvalues[1])])[0]

@@ -227,8 +227,8 @@ hj.plot.save_figure(figure, "paper-tunnel.png")
 # ## Figure 6: a brain at several times
 #
 # This example uses an analytic phantom; notebooks/brain.py uses a scan. The paper uses the diffusion tensor as the
-# metric, T = D, in which strong diffusion makes distances long. The metric of the diffusion itself is g = D⁻¹. In
-# tissue the two signatures are nearly opposite.
+# metric, T = D, in which strong diffusion makes distances long. In the metric g = D⁻¹ strong diffusion makes distances
+# short. In tissue the two signatures are nearly opposite.
 
 # %%
 tensors, mask, spacing = phantom((38, 44))

@@ -1,7 +1,6 @@
 """Compute the heat kernel signature of a tensor volume or a mesh, and the facts for the report."""
 
 import argparse
-import math
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Literal, NamedTuple
 
@@ -14,14 +13,21 @@ from hks_jax.cli.options import SOLVING, as_options, defaults
 from hks_jax.cli.parsing import Times, parse_times
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
-from hks_jax.domain.tensor_checks import Interpolation, MetricChoice
+from hks_jax.domain.tensor_checks import Interpolation, MetricChoice, OperatorChoice
 from hks_jax.eigen.automatic import choose_solvers
 from hks_jax.fem.boundary import BoundarySpec, default_boundary, unreached_sides
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result
 from hks_jax.io.units import median_mean_diffusivity
 from hks_jax.signatures.hks import HKSMethod, Normalisation
-from hks_jax.signatures.times import default_k
+from hks_jax.signatures.rim import estimate_of, free_share, influence_of, is_estimated, is_known, rim_of
+from hks_jax.signatures.spans import SHORTEST, resolved_span
+from hks_jax.signatures.times import FREE, default_k, times_of
+
+EARLY = 0.02
+"""The truncated share of the signature above which the boundary's influence is estimated without eigenpairs."""
+HALF = 0.45
+"""The share of nodes free of the boundary below which a time is warned of; automatic times aim at one half."""
 
 
 class ComputationError(RuntimeError):
@@ -32,10 +38,12 @@ class ComputationError(RuntimeError):
 class Settings:
     """The settings of a computation, with the names of the options.
 
-    The metric is None only for meshes. For the boundary, None means `default_boundary` for volumes, neumann for meshes.
+    The metric is None for Fick's operator, and for a mesh with the Euclidean metric. For the boundary, None means
+    `default_boundary` for volumes, neumann for meshes.
     """
 
     metric: MetricChoice | None
+    operator: OperatorChoice
     interpolation: Interpolation
     k: int | None
     boundary: BoundarySpec | None
@@ -50,8 +58,14 @@ class Settings:
     def of(cls, args: argparse.Namespace | None = None, **given: Any) -> "Settings":
         """Return the settings in `args`, or else the default settings; settings in `given` replace some of them."""
         chosen = vars(defaults(f"@metric {SOLVING} @signature")) | (vars(args) if args else {})
-        given = {"metric": chosen["metric"] or "tensor", "times": parse_times(chosen["times"]), **given}
+        metric = chosen["metric"] or (None if chosen["operator"] == "fick" else "tensor")
+        given = {"metric": metric, "times": parse_times(chosen["times"]), **given}
         return cls(**{field.name: chosen[field.name] for field in fields(cls)} | given)
+
+    def field(self, grid: hj.Grid, tensors: Any) -> hj.TensorField:
+        """Return the field of diffusion tensors with the metric or the operator of these settings."""
+        of: Any = {"operator": self.operator, "interpolation": self.interpolation, "name": "tensors"}
+        return hj.TensorField.from_diffusion(grid, tensors, self.metric, **of)
 
 
 class Solved(NamedTuple):
@@ -79,39 +93,98 @@ def result_of(
     """Compute the signature on a mesh, or on a volume whose mask is the domain; the report includes `described`."""
     with progress.stage("signature"):
         times = settings.times.explicit or automatic_times(pairs, settings.times.automatic)
-        if not settings.times.automatic:
-            _warn_of_late(times, pairs, progress)
         values, origin = _signature(pairs, times, settings)
+        influence = _influence(pairs, times)
+        free = None if influence is None else np.asarray(free_share(influence, pairs.space))
     report = {"input": described, **_report(settings, pairs, times), **origin}
-    return Result(place, values, np.asarray(times), np.asarray(pairs.eigenvalues), report)
+    arrays = {} if influence is None or not np.nanmax(influence) else {"influence": influence.astype(np.float32)}
+    if pairs.pencil.density is not None:
+        arrays["density"] = np.asarray(pairs.pencil.density)
+    result = Result(place, values, np.asarray(times), np.asarray(pairs.eigenvalues), report, arrays)
+    rows = report["times"]
+    for name, column in (("length", result.lengths), ("free_of_rim", free)):
+        for row, value in zip(rows, [None] * len(rows) if column is None else column.tolist(), strict=True):
+            row[name] = value
+    report |= {"units": result.units, "rim": _rim_report(pairs, influence)}
+    _tell_of_times(result, free, pairs, progress)
+    return result
 
 
-def _warn_of_late(times: tuple[float, ...], pairs: hj.Eigenpairs, progress: Progress) -> None:
+def _influence(pairs: hj.Eigenpairs, times: tuple[float, ...]) -> np.ndarray | None:
+    """Return the influence of the boundary (n_times, *shape), or None if it is not known."""
+    if not is_known(pairs.pencil):
+        return None
+    t = times_of(pairs, times)
+    found, early = np.array(influence_of(pairs, t)), np.asarray(hj.truncation(pairs, t).tail) > EARLY
+    if early.any():  # the eigenpairs do not resolve the signatures of the two problems
+        found[early] = np.asarray(estimate_of(pairs, t[early]))
+    return found
+
+
+def _rim_report(pairs: hj.Eigenpairs, influence: np.ndarray | None) -> dict[str, Any]:
+    """Return the entry of the report about the boundary's influence: the limit, and how it was computed."""
+    if influence is None:
+        return {"limit": FREE, "influence": "not known"}
+    if not rim_of(pairs.pencil).any():
+        return {"limit": FREE, "influence": "none, because the domain has no boundary"}
+    exact = "from the eigenpairs of both boundary problems"
+    return {"limit": FREE, "influence": "estimated from first passage times" if is_estimated(pairs) else exact}
+
+
+def _tell_of_times(result: Result, free: np.ndarray | None, pairs: hj.Eigenpairs, progress: Progress) -> None:
+    """Print the times, and warn of times at which most nodes feel the boundary, or at which heat fills the domain."""
+    progress.note(f"t = {', '.join(times_in_words(result.times, result.lengths, result.unit, result.length_unit))}")
+    if free is None or not rim_of(pairs.pencil).any():
+        _warn_of_late(result.times, pairs, progress)
+        return
+    share = ", ".join(f"{100 * one:.0f}" for one in free)
+    how = " (estimated)" * is_estimated(pairs)
+    progress.note(f"nodes with less than {100 * FREE:.0f} % influence of the boundary{how}: {share} %")
+    late = free < HALF
+    if late.any():
+        shown = ", ".join(f"{t:.4g}" for t in result.times[late])
+        remedy = "Choose smaller times"
+        if result.times[late][0] <= SHORTEST * result.smallest_time:
+            remedy += ", which need more eigenpairs (-k) or --method auto"
+        progress.warn(
+            f"at {late.sum()} of {late.size} times, most nodes feel the boundary: at t = {shown}, it contributes over "
+            f"{100 * FREE:.0f} % of the signature at {', '.join(f'{100 * (1 - one):.0f}' for one in free[late])} % of "
+            f"the nodes, which pictures hatch. There, the shape of the domain shows, and not curvature. {remedy}"
+        )
+
+
+def times_in_words(times: Any, lengths: Any, unit: str, length_unit: str) -> list[str]:
+    """Return each time with its unit and, if known, with the length √(Dt)."""
+    words = [f"{t:.4g} {unit}".rstrip() for t in times]
+    if lengths is None:
+        return words
+    return [f"{w} (√(Dt) = {length:.3g} {length_unit}".rstrip() + ")" for w, length in zip(words, lengths, strict=True)]
+
+
+def _warn_of_late(t: np.ndarray, pairs: hj.Eigenpairs, progress: Progress) -> None:
     """Warn of times at which heat fills the domain: for a box, √t then exceeds about 0.6 times its sides."""
-    t, d, volume, problems = np.asarray(times), pairs.space.dimension, pairs.pencil.volume, len(pairs.pencil.parts)
-    assert d is not None
-    assert volume is not None
+    d, volume, problems = pairs.space.dimension, pairs.pencil.volume, len(pairs.pencil.parts)
+    if volume is None or d is None:
+        return
     heat = np.exp(-np.outer(t, pairs.eigenvalues)).sum(axis=1) / float(volume)  # the mean of the signature
     late = t[heat * (4 * np.pi * t) ** (d / 2) > 1.5 * 2**d / min(problems, 2)]
     if late.size:
         shown = ", ".join(f"{s:.4g}" for s in late)
         progress.warn(
-            f"{late.size} of {len(times)} times are too large for the domain: at t = {shown}, √t is more than half "
+            f"{late.size} of {len(t)} times are too large for the domain: at t = {shown}, √t is more than half "
             "of its size or thickness, which the signature then mainly shows. Choose smaller times"
         )
 
 
 def automatic_times(pairs: hj.Eigenpairs, n: int) -> tuple[float, ...]:
-    """Return n default times; at the last time, √t is about a third of the length of the domain."""
-    return tuple(np.asarray(hj.default_times(pairs, n, math.exp(-((math.pi / 3) ** 2))), np.float64).tolist())
+    """Return n default times, from the first that the eigenpairs resolve (`resolved_span`)."""
+    return tuple(np.asarray(resolved_span(pairs, n), np.float64).tolist())
 
 
 def field_of(volume: TensorVolume, grid: hj.Grid, settings: Settings) -> hj.TensorField:
-    """Return the metric of a volume or slice on its grid, in the chosen precision."""
+    """Return the field of a volume or slice on its grid, in the chosen precision."""
     use_dtype(settings.dtype)
-    metric, lies, tensors = settings.metric, settings.interpolation, volume.tensors.astype(settings.dtype)
-    assert metric is not None
-    return hj.TensorField.from_diffusion(grid, tensors, metric, interpolation=lies, name="tensors")
+    return settings.field(grid, volume.tensors.astype(settings.dtype))
 
 
 def compute_pairs(volume: TensorVolume, settings: Settings, progress: Progress) -> Solved:

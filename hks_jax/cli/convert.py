@@ -12,6 +12,7 @@ examples:
 
 import argparse
 import sys
+from pathlib import Path
 
 from hks_jax.cli.computation import describe_input
 from hks_jax.cli.options import READING
@@ -20,11 +21,17 @@ from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read
 from hks_jax.io import find_invalid, save_tensors
 from hks_jax.io.formats import WRITTEN
+from hks_jax.io.repair import describe_invalid
 
 OPTIONS = f"""
 @file {READING}
 output OUT  the file to write; an existing file is replaced
 """
+
+
+def writes(args: argparse.Namespace) -> list[Path]:
+    """Return the files that the command may write."""
+    return [args.output]
 
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
@@ -33,12 +40,9 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         raise ValueError(f"OUT: got {args.output}; expected a name that ends in {', '.join(WRITTEN)}")
     if args.output.is_dir():
         raise IsADirectoryError(f"OUT: got the folder {args.output}; expected a file")
-    if args.output.exists() and args.output.samefile(args.file):
-        raise ValueError(f"OUT: got {args.output}, the same file as FILE. Choose another name")
     volume = read(args, progress)
-    invalid = int(find_invalid(volume).sum())
-    if invalid:
-        progress.warn(f"{invalid} tensors are not positive definite and are written unchanged; see --repair")
+    if (bad := find_invalid(volume)).any():
+        progress.warn(f"{int(bad.sum())} tensors are {describe_invalid(volume, bad)}; written unchanged, see --repair")
     with progress.stage("writing", str(args.output)):
         save_tensors(args.output, volume, provenance={"command": sys.argv, "repair": dict(volume.repair) or None})
-    return Done([args.output], {**describe_input(volume), "not_positive_definite": invalid})
+    return Done([args.output], {**describe_input(volume), "not_positive_definite": int(bad.sum())})

@@ -12,13 +12,14 @@ examples:
 """
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hks_jax.cli.computation import Settings, describe_input, field_of
-from hks_jax.cli.options import READING
-from hks_jax.cli.outputs import Done, writing
+from hks_jax.cli.options import READING, refuse
+from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read_volume
 from hks_jax.curvature import gaussian_curvature
@@ -35,12 +36,18 @@ COLOURED = 0.98
 """The quantile of absolute values at the ends of the colour scale; the curvature of noisy tensors has outliers."""
 
 
+def writes(args: argparse.Namespace) -> list[Path]:
+    """Return the files that the command may write."""
+    return [args.output / name for name in ("curvature.*", REPORT)]
+
+
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
     from hks_jax.plot import hks_panels
     from hks_jax.plot.signature import cropped, placed
 
     volume, settings, periodic = read_volume(args, progress), Settings.of(args), args.periodic or ""
+    refuse(args, ("operator",), "the curvature is that of a metric; pass --metric inverse for that of D⁻¹")
     if volume.dimension != 2:
         raise ValueError(
             f"--slice: got tensors on a volume of shape {volume.shape}; expected two dimensions for the Gaussian "
@@ -70,12 +77,15 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         },
     }
     stale = [args.output / f"curvature{suffix}" for suffix in WRITTEN]
-    with writing(args.output, report, progress, lambda: stale) as (folder, done):
-        result = Result(volume, curvature[None], np.zeros(0), report=report, name="curvature")
-        result.save(folder / "curvature", format_of(args.file).image)
+
+    def draw(path: Path) -> None:
         grid, box = cropped(volume, known)
         limit = float(np.quantile(np.abs(values), COLOURED)) or 1.0
         style: dict[str, Any] = {"cmap": "RdBu_r", "limits": [(-limit, limit)], "label": "in 1/length² of the metric"}
-        style |= {"orientation": placed(volume, box, args.view), "path": folder / "curvature.png"}
+        style |= {"orientation": placed(volume, box, args.view), "path": path}
         hks_panels(curvature[None, *box], [0.0], grid, titles=["Gaussian curvature"], **style)
+
+    with writing(args.output, report, progress, lambda: stale, {"curvature.png": draw}) as (folder, done):
+        result = Result(volume, curvature[None], np.zeros(0), report=report, name="curvature")
+        result.save(folder / "curvature", format_of(args.file).image)
     return done

@@ -12,9 +12,6 @@ examples:
 import argparse
 import importlib.util
 from functools import partial
-from typing import Any
-
-import numpy as np
 
 from hks_jax.cli.computation import Settings, compute_pairs
 from hks_jax.cli.noise import signature_of
@@ -23,22 +20,22 @@ from hks_jax.cli.parsing import Times
 from hks_jax.cli.progress import Progress
 from hks_jax.domain import examples
 from hks_jax.io import TensorVolume, erode, find_example_brain, fit_dwi
-from hks_jax.io.units import MM2_PER_S, median_mean_diffusivity
+from hks_jax.io.units import MM2_PER_S
 
 OPTIONS = """
 -o,--output OUT = demo  folder for the results
 --phantom  use the phantom even if the brain is installed
-@view
+@view @rim
 """
 
 B_MAX = 1000.0
 """The largest b-value, in s/mm², up to which a single tensor describes the signal well."""
 RIM = 2
 """The number of voxels eroded from the mask, because boundary voxels contain several tissues and have bad fits."""
-SPREADS = 2.5 * 2 ** (np.arange(7) / 2)
-"""The diffusion lengths √(Dt) at the drawn times, in voxels, from one voxel to the size of the brain."""
+N_TIMES = 7
+"""The number of drawn times, from the first resolved time to the time at which half of the nodes are near the rim."""
 N_PAIRS = 600
-"""The number of eigenpairs of both boundary problems together that the smallest time needs."""
+"""The number of eigenpairs of both boundary problems together."""
 PHANTOM_SHAPE = (72, 80)
 
 
@@ -57,15 +54,13 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         with progress.stage("tensor fit", f"{brain.images.name}, b ≤ {B_MAX:g} s/mm²"):
             volume = fit_dwi(brain.images, brain.bval, brain.bvec, brain.mask, b_max=B_MAX).slice("z", 0)
             volume = volume.with_mask(erode(volume.inside, RIM))
-    times = (min(volume.spacing) * SPREADS) ** 2 / median_mean_diffusivity(volume)
-    chosen: dict[str, Any] = {"metric": "inverse", "components": "largest", "k": N_PAIRS, "normalisation": "flat"}
-    settings = Settings.of(**chosen, times=Times(tuple(times.tolist()), 0))
+    settings = Settings.of(metric="inverse", components="largest", k=N_PAIRS, times=Times((), N_TIMES))
     result = signature_of(args, compute_pairs(volume, settings, progress), None, progress)
     title = (
         rf"$4\pi t\,$HKS of {'a phantom' if brain is None else 'a brain slice'}, metric D⁻¹. The value 1 means flat; "
-        "larger values mean positive curvature of the metric or the boundary"
+        "larger values mean positive curvature"
     )
-    drawing = partial(signature_panels, result, title=title, view=args.view)
+    drawing = partial(signature_panels, result, title=title, view=args.view, show_rim=args.show_rim)
     done = write_outputs(args.output, result, progress, drawing, "" if brain is None else ".nii.gz")
     picture = next(file for file in done.files if file.suffix == ".png")
     return done._replace(text=f"The picture is {picture}")

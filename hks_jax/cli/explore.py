@@ -27,16 +27,25 @@ result RESULT  the folder OUT that 'hks-jax hks' wrote, or an .npz from there
 --labels FILE  region numbers on the same voxels or at the vertices, with 0 for unlabelled (NIfTI, MRtrix, NRRD or .npy)
 @names
 --title TEXT  the page's title (default: the name of the tensors' file)
---unit TEXT  the unit of t (default: s for the metric D⁻¹ of tensors whose unit is known, otherwise none)
+--unit-of-t TEXT  unit of t, if the result does not have it (default: that of the result)
+@view
 """
+
+
+def writes(args: argparse.Namespace) -> list[Path]:
+    """Return the files that the command may write."""
+    return [_page(args)]
+
+
+def _page(args: argparse.Namespace) -> Path:
+    return args.output or signature_file(args.result).with_name("explore.html")
 
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
     from hks_jax.plot import explore
 
-    source = signature_file(args.result)
-    page = args.output or source.with_name("explore.html")
+    source, page = signature_file(args.result), _page(args)
     if page.suffix.lower() not in (".html", ".htm"):
         raise ValueError(f"--output: got {page}; expected a name that ends in .html")
     if args.labels is None:
@@ -48,5 +57,5 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
             labels, names = read_labels(args.labels, result.place), names_of(args.labels, args.names)[1]
     with progress.stage("writing", str(page)):
         title = args.title or Path(getattr(result.place, "source", "")).name or source.parent.name
-        explore(result, page, labels=labels, label_names=names, title=title, unit=args.unit)
+        explore(result, page, labels=labels, label_names=names, title=title, unit=args.unit_of_t, view=args.view)
     return Done([page], {"source": str(source), "times": result.times.tolist()})

@@ -1,8 +1,8 @@
 """Find the metric that has a given signature.
 
-Find the metric that has a given heat kernel signature. TARGET is an npz that 'hks-jax hks' wrote without
-normalisation. TARGET contains 'hks' (n_times, *shape), 'times', 'spacing', 'origin', and optionally 'mask' and
-'affine'.
+Find the metric that has a given heat kernel signature. TARGET is an npz that 'hks-jax hks' wrote with the
+normalisation flat, the default, or raw. TARGET contains 'hks' (n_times, *shape), 'times', 'spacing', 'origin', and
+optionally 'mask' and 'affine'.
 
 The command writes to the folder OUT: tensors.npz (the metric), fit.npz (its signature, and the loss at each step),
 fit.png (in two dimensions) and report.json. Ctrl-C ends the fit and writes the best metric found until then.
@@ -16,6 +16,7 @@ import json
 import math
 import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,11 +24,14 @@ import numpy as np
 from hks_jax import Grid, TensorField
 from hks_jax.cli.computation import ComputationError, use_dtype
 from hks_jax.cli.options import FORMATS, refuse
-from hks_jax.cli.outputs import Done, writing
+from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.progress import Progress
+from hks_jax.cli.reading import require_one
+from hks_jax.domain.tensor_field import diffusion_tensors
 from hks_jax.fem.boundary import unreached_sides
-from hks_jax.io import read_tensors, save, save_tensors
+from hks_jax.io import find_invalid, read_tensors, save, save_tensors
 from hks_jax.io.formats import format_of
+from hks_jax.io.repair import describe_invalid
 from hks_jax.io.result import Result, plain, tuples
 from hks_jax.io.volume import TensorVolume, digest, require_position
 
@@ -37,7 +41,11 @@ target TARGET  the signature, an .npz file or the folder of a signature
 --init FILE  the initial tensors: {FORMATS} (default: identity)
 --metric tensor|inverse|adjugate
     the metric of the tensors D in --init: inverse is D⁻¹, tensor is D itself, adjugate is |D|D⁻¹. This option is
-    required except for NumPy's files without a unit of length, whose tensors are the metric by default
+    required except for NumPy's files without a unit of length, whose tensors are the metric by default, and for
+    --operator fick
+--operator laplace-beltrami|fick
+    the operator of the target, as for 'hks-jax hks' (default: the operator in TARGET, otherwise laplace-beltrami). With
+    fick, tensors.npz contains the diffusivity D
 --order ORDER  order of the components in --init, if the file does not declare it
 @interpolation
 --parametrisation log-euclidean|cholesky|conformal|eigenvalues|rotation = log-euclidean
@@ -67,12 +75,16 @@ _OF_SEARCH = ("optimiser", "smoothness", "max_steps", "continuation", "starts", 
 """Options that are arguments of `Search` with the same name."""
 
 
+def writes(args: argparse.Namespace) -> list[Path]:
+    """Return the files that the command may write."""
+    checkpoint = [] if args.checkpoint is None else [args.checkpoint]
+    return [*(args.output / name for name in ("tensors.npz", "fit.npz", "fit.png", REPORT)), *checkpoint]
+
+
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
     if args.init is None:
         refuse(args, ("metric", "order"), "this option describes the tensors in --init, which is missing; pass both")
-    elif args.metric is None and format_of(args.init).image:
-        raise ValueError(_NO_METRIC)
     from hks_jax import fit_metric
     from hks_jax.inverse import H1, Data, Search, TotalVariation
     from hks_jax.inverse.metric_fit import RESULTS
@@ -80,11 +92,15 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     use_dtype(args.dtype)
     with progress.stage("reading", str(args.target)):
         target = Result.read(args.target, "hks", over_times=True)
-        if target.normalisation != "raw":
+        if target.normalisation not in ("raw", "flat"):
             raise ValueError(
-                f"TARGET: got {target.source} with the normalisation {target.normalisation}; expected raw. Compute "
-                "it by 'hks-jax hks' without --normalisation"
+                f"TARGET: got {target.source} with the normalisation {target.normalisation}; expected raw or flat. "
+                "Compute it by 'hks-jax hks' without --normalisation"
             )
+        args.operator = args.operator or target.settings.get("operator", "laplace-beltrami")
+        require_one(args)
+        if target.normalisation == "flat":
+            target = replace(target, values=target.values / target.to_flat)
         # The mask is the domain of the computed signature, so all of its components belong to the domain.
         grid = target.grid
         init = _initial(args, target.volume, grid, progress)
@@ -114,7 +130,19 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         raise ComputationError(f"the fit failed: {RESULTS['not finite']}. Check --init and -k")
     if not fit.converged:
         progress.warn(f"the fit ended early, {fit.result}: {RESULTS[fit.result]}; writing the best metric found")
-    names = ("init", "metric", "interpolation", "h1", "tv", "dtype", "checkpoint", "noise", "boundary", *_OF_SEARCH)
+    names = (
+        "init",
+        "metric",
+        "operator",
+        "interpolation",
+        "h1",
+        "tv",
+        "dtype",
+        "checkpoint",
+        "noise",
+        "boundary",
+        *_OF_SEARCH,
+    )
     report = {
         "target": {
             "source": target.source,
@@ -136,9 +164,13 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
 def _initial(args: argparse.Namespace, target: TensorVolume, grid: Grid, progress: Progress) -> TensorField:
     if args.init is None:
         unit = np.eye(grid.dimension, dtype=args.dtype)
-        return TensorField(grid, np.broadcast_to(unit, (*grid.shape, *unit.shape)), args.interpolation)
+        tensors = np.broadcast_to(unit, (*grid.shape, *unit.shape))
+        return TensorField(grid, tensors, args.interpolation, operator=args.operator)
+    fick = args.operator == "fick"
+    if args.metric is None and not fick and format_of(args.init).image:
+        raise ValueError(_NO_METRIC)
     volume = read_tensors(args.init, args.order)
-    if args.metric is None and volume.length_unit:  # of NumPy's files, as in `require_metric`
+    if args.metric is None and not fick and volume.length_unit:  # of NumPy's files, as in `require_metric`
         raise ValueError(_NO_METRIC)
     if volume.shape != grid.shape:
         remedy = "Give one tensor for each node of the target"
@@ -155,25 +187,34 @@ def _initial(args: argparse.Namespace, target: TensorVolume, grid: Grid, progres
             f"--init: got no tensors at {lacking} of the target's {int(grid.inside.sum())} nodes; expected tensors at "
             "all nodes of the target. Restrict the target to the mask of --init"
         )
-    metric: Any = args.metric or "tensor"
-    tensors = volume.tensors.astype(args.dtype)
-    return TensorField.from_diffusion(grid, tensors, metric, interpolation=args.interpolation, name="--init")
+    volume = volume.with_mask(grid.mask)
+    if (bad := find_invalid(volume)).any():
+        raise ValueError(
+            f"--init: {int(bad.sum())} of {int(grid.inside.sum())} tensors are {describe_invalid(volume, bad)}. Write "
+            f"repaired tensors by 'hks-jax convert {args.init} repaired.npz --repair nearest', and pass that file"
+        )
+    metric: Any = args.metric or (None if fick else "tensor")
+    of: Any = {"operator": args.operator, "interpolation": args.interpolation, "name": "--init"}
+    return TensorField.from_diffusion(grid, volume.tensors.astype(args.dtype), metric, **of)
 
 
 def _write(args: argparse.Namespace, fit: Any, target: Result, report: dict[str, Any], progress: Progress) -> Done:
     from hks_jax.plot import fit_panels, save_figure
     from hks_jax.plot.signature import placed
 
-    volume = replace(target.volume, tensors=np.asarray(fit.field.domain_tensors), order="matrix", frame="voxel")
+    tensors = diffusion_tensors(fit.field) if args.operator == "fick" else fit.field.domain_tensors
+    volume = replace(target.volume, tensors=np.asarray(tensors), order="matrix", frame="voxel")
     volume = replace(volume, source=target.source, digest=digest(target.source), notes=(), unit="")
     history = {"losses": "loss", "misfits": "misfit", "stages": "stage", "starts": "start"}
     columns = {name: np.array([getattr(step, of) for step in fit.history]) for name, of in history.items()}
-    with writing(args.output, report, progress, lambda: [args.output / "fit.png"]) as (folder, done):
+
+    def draw(path: Path) -> None:
+        save_figure(fit_panels(fit, target.values, target.times, orientation=placed(volume, None, args.view)), path)
+
+    pictures = {"fit.png": draw} if volume.dimension == 2 else {}
+    with writing(args.output, report, progress, lambda: [args.output / "fit.png"], pictures) as (folder, done):
         origin, extra = {"command": sys.argv, "settings": report["settings"]}, {"times": target.times, **columns}
         metric = replace(volume, length_unit="")  # otherwise, the tensors count as diffusion tensors when they are read
         save_tensors(folder / "tensors.npz", metric, provenance=origin)
         save(folder / "fit.npz", np.asarray(fit.hks), volume, name="hks", extra=extra, provenance=origin)
-        if volume.dimension == 2:
-            figure = fit_panels(fit, target.values, target.times, orientation=placed(volume, None, args.view))
-            save_figure(figure, folder / "fit.png")
     return done

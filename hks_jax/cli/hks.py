@@ -14,7 +14,7 @@ along the fourth axis of the image.
 examples:
   hks-jax hks tensor.nii.gz -o out --metric inverse
   hks-jax hks tensor.nii.gz -o out --mask mask.nii.gz --slice z=14 --metric inverse -k 100 --times auto:8
-  hks-jax hks out/pairs.npz -o later --times auto:24 --normalisation flat
+  hks-jax hks out/pairs.npz -o later --times auto:24
   hks-jax hks heart.vtu -o out --array D --metric inverse -k 50
   hks-jax hks lh.white --tensors dti.nii.gz -o out --metric inverse
   hks-jax hks dwi.nii.gz --bval dwi.bval --bvec dwi.bvec -o out --slice z=10 --metric inverse --components largest
@@ -36,9 +36,9 @@ from hks_jax.cli.computation import Settings, compute_pairs, result_of, solve, u
 from hks_jax.cli.info import describe_mesh
 from hks_jax.cli.noise import Noisy, check_noise, noise_of_volume, signature_of, with_error_bars
 from hks_jax.cli.options import READING, SOLVING, options_in, refuse
-from hks_jax.cli.outputs import PAIRS, Done, of_earlier, write_outputs
+from hks_jax.cli.outputs import PAIRS, REPORT, Done, of_earlier, write_outputs
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import read, read_volume, require_metric
+from hks_jax.cli.reading import read, read_volume, require_metric, require_one
 from hks_jax.fem.assembly import MESH_BOUNDARIES
 from hks_jax.io import read_mask, read_mesh, read_mesh_arrays, sample_tensors
 from hks_jax.io.formats import format_of
@@ -61,13 +61,18 @@ OPTIONS = f"""
 --inside FILE
     vertices of a mesh that form the domain, such as a cortical surface without its medial wall: FreeSurfer's .label, or
     zeros and ones in .npy or in the array 'mask' of an .npz
-@signature @noise @view
+@signature @noise @view @rim
 --save-pairs  write the eigenpairs to OUT/pairs.npz; 'hks-jax hks OUT/pairs.npz --times …' reuses them
 """
 
-_OF_TENSORS = ("metric", "order", "interpolation")
+_OF_TENSORS = ("metric", "operator", "order", "interpolation")
 """Options that refer to tensors at the vertices of a mesh."""
 _NO_NOISE = "this option needs tensors; saved eigenpairs and meshes with the Euclidean metric have none. Leave it out"
+
+
+def writes(args: argparse.Namespace) -> list[Path]:
+    """Return the files that the command may write."""
+    return [args.output / name for name in ("hks.*", REPORT, *[PAIRS] * args.save_pairs)]
 
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
@@ -106,7 +111,8 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
                 file.unlink(missing_ok=True)
             saved_pairs.write_pairs(args.output / PAIRS, solved, image, progress.warnings)
     result = signature_of(args, solved, noise, progress)
-    drawing = partial(signature_panels, result, view=args.view, through=args.through)
+    style = {"view": args.view, "through": args.through, "show_rim": args.show_rim}
+    drawing = partial(signature_panels, result, **style)
     done = write_outputs(args.output, result, progress, drawing, image)
     return done._replace(files=[*done.files, *[args.output / PAIRS] * args.save_pairs])
 
@@ -129,7 +135,7 @@ def _on_mesh(args: argparse.Namespace, settings: Settings, progress: Progress) -
     image = args.file.suffix.lower()
     if image not in WRITTEN or (image == ".ply" and isinstance(mesh, TetMesh)):  # formats without values at vertices
         image = ".vtu"
-    return write_outputs(args.output, result, progress, partial(_draw_mesh, result), image)
+    return write_outputs(args.output, result, progress, partial(_draw_mesh, result, args.show_rim), image)
 
 
 def _check_mesh_options(args: argparse.Namespace) -> None:
@@ -148,8 +154,12 @@ def _check_mesh_options(args: argparse.Namespace) -> None:
         why = "this option needs tensors, but without --array and --tensors a mesh has the Euclidean metric"
         refuse(args, _OF_TENSORS, f"{why}. Pass --array or --tensors, or leave this option out")
         refuse(args, ("noise",), _NO_NOISE)
-    elif args.metric is None:
-        raise ValueError("--metric: the tensors at the vertices need a metric. Choose inverse, tensor or adjugate")
+    elif args.metric is None and args.operator != "fick":
+        raise ValueError(
+            "--metric: the tensors at the vertices need a metric. Choose inverse, tensor or adjugate, or pass "
+            "--operator fick"
+        )
+    require_one(args)
 
 
 def _read_domain(args: argparse.Namespace, progress: Progress) -> tuple[SurfaceMesh | TetMesh, Noisy | None]:
@@ -170,7 +180,7 @@ def _read_domain(args: argparse.Namespace, progress: Progress) -> tuple[SurfaceM
     settings: Any = {"at": "vertices", "interpolation": args.interpolation, "mask": inside}
 
     def domain(tensors: Any) -> SurfaceMesh | TetMesh:
-        return kind.from_tensors(vertices, cells, tensors, args.metric, **settings)
+        return kind.from_tensors(vertices, cells, tensors, args.metric, operator=args.operator, **settings)
 
     if args.tensors:
         volume = read(argparse.Namespace(**vars(args) | {"file": args.tensors, "others": []}), progress)
@@ -217,23 +227,29 @@ def _inside(path: Path, n_vertices: int) -> Bool[np.ndarray, " V"]:
     return np.isin(np.arange(n_vertices), numbers)
 
 
-def _draw_mesh(result: Result, path: Path) -> None:
+def _draw_mesh(result: Result, show_rim: bool, path: Path) -> None:
     """Draw the signature on the surface, or on the boundary of a solid, with a separate colour scale for each time."""
-    from hks_jax.plot import new_figure, number_text, save_figure, surface
+    from hks_jax.plot import new_figure, save_figure, surface
     from hks_jax.plot.images import colours_of
-    from hks_jax.plot.signature import LEAST_RANGE, caption
+    from hks_jax.plot.signature import LEAST_RANGE, caption, legend, nodes_for_colours, titles_of
 
     mesh = result.place
     assert isinstance(mesh, SurfaceMesh | TetMesh)
-    cells = mesh.triangulation
+    cells, near = mesh.triangulation, None if show_rim else result.near_rim
     visible = cells.boundary_vertices if isinstance(mesh, TetMesh) else cells.used
+    words = legend(result, near)
+    if near is not None and near[:, visible].all():  # as on the boundary of a solid, where hatching would show nothing
+        near, words = None, ["the boundary contributes over 10 % at all vertices"]
     columns = min(len(result.times), 4)
     rows = math.ceil(len(result.times) / columns)
-    figure = new_figure(3.4 * columns, 3.0 * rows + 0.3)
-    figure.suptitle(caption(result))
-    for i, (time, values) in enumerate(zip(result.times, result.values, strict=True)):
+    figure = new_figure(3.4 * columns, 3.0 * rows + 0.3 + 0.3 * len(words))
+    figure.suptitle("\n".join([caption(result), *words]))
+    centre = 1.0 if result.normalisation == "flat" else None
+    shown = [values[nodes] for values, nodes in zip(result.values, nodes_for_colours(result, visible), strict=True)]
+    colours = colours_of(shown, least_range=LEAST_RANGE, centre=centre)
+    for i, (title, values, (low, high, cmap)) in enumerate(zip(titles_of(result), result.values, colours, strict=True)):
         ax = figure.add_subplot(rows, columns, i + 1, projection="3d")
-        ((low, high, _),) = colours_of([values[visible]], least_range=LEAST_RANGE)
-        figure.colorbar(surface(ax, mesh, values, vmin=low, vmax=high), ax=ax, shrink=0.6)
-        ax.set_title(f"$t$ = {number_text(float(time))}", fontsize="medium")
+        style: dict[str, Any] = {"vmin": low, "vmax": high, "cmap": cmap, "hatched": None if near is None else near[i]}
+        figure.colorbar(surface(ax, mesh, values, **style), ax=ax, shrink=0.6)
+        ax.set_title(title, fontsize="medium")
     save_figure(figure, path)

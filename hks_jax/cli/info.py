@@ -20,7 +20,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
+from hks_jax.cli.computation import times_in_words
 from hks_jax.cli.options import READING, as_options
 from hks_jax.cli.pairs import arrays_in
 from hks_jax.cli.progress import Progress
@@ -32,10 +34,11 @@ from hks_jax.domain.tensor_checks import MANY, unsymmetric
 from hks_jax.fem.boundary import BoundarySpec, default_boundary
 from hks_jax.io import TensorVolume, find_invalid, read_mesh
 from hks_jax.io.mesh import is_mesh
+from hks_jax.io.repair import least_admissible
 from hks_jax.io.result import NAMES, Result, signature_file
-from hks_jax.io.units import MM2_PER_S, by_axis, is_plausible
+from hks_jax.io.units import MEDIAN, MM2_PER_S, by_axis, is_plausible, unit_of_times
 from hks_jax.io.volume import digest
-from hks_jax.signatures.times import suitable, suitable_times
+from hks_jax.signatures.times import FREE, suitable, suitable_times
 
 OPTIONS = f"@file {READING} @clean"
 
@@ -69,8 +72,9 @@ def _describe_result(result: Result) -> dict[str, Any]:
         "shape": result.values.shape[1:],
         "inside": int(np.isfinite(result.values[0]).sum()),
         **{name: value for name, value in result.settings.items() if value},
-        "times": result.times.tolist(),
-        "√(Dt)": [] if result.lengths is None else result.lengths.tolist(),
+        "times": times_in_words(result.times, result.lengths, result.unit, result.length_unit),
+        "D": "" if result.diffusivity is None else f"{result.diffusivity:.3g}, {MEDIAN}",
+        "near the rim": _shares(result),
         "to draw it": f"hks-jax plot {source} -o picture.png",
     }
     if result.name == "hks":
@@ -79,9 +83,19 @@ def _describe_result(result: Result) -> dict[str, Any]:
     return facts
 
 
+def _shares(result: Result) -> str:
+    """Return the share of nodes at each time at which the boundary contributes over a tenth, in words, if known."""
+    if result.near_rim is None:
+        return ""
+    nodes = np.isfinite(result.values[0]).sum()
+    shares = result.near_rim.reshape(len(result.times), -1).sum(axis=1) / nodes
+    return ", ".join(f"{100 * share:.0f} %" for share in shares) + f" of the nodes (influence over {100 * FREE:.0f} %)"
+
+
 def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = None) -> dict[str, Any]:
     """Return facts about a volume for JSON. If `boundary` is None, `default_boundary` determines suitable k and t."""
     inside, bad = volume.inside, find_invalid(volume)
+    not_positive = int(find_invalid(volume, 0.0).sum())
     boundary = default_boundary(inside)[0] if boundary is None else boundary
     good = inside & ~bad
     labels, count = label_nodes(inside, (False,) * volume.dimension)
@@ -99,7 +113,9 @@ def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = N
         "without_element": int((inside & (labels == 0)).sum()),
         "boundary": boundary,
         "component_sizes": np.sort(np.bincount(labels.ravel())[1:])[::-1][:10].tolist(),
-        "not_positive_definite": int(bad.sum()),
+        "not_positive_definite": not_positive,
+        "nearly_singular": int(bad.sum()) - not_positive,
+        "least_admissible_eigenvalue": least_admissible(volume),
         "not_symmetric": int((inside & unsymmetric(volume.tensors)).sum()),
     }
     wrong = volume.invalid_by_order
@@ -115,6 +131,7 @@ def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = N
     if count and good.any() and bad.sum() <= MANY * inside.sum():
         metrics = {"inverse": np.linalg.inv(tensors), "tensor": tensors}
         description["suits"] = {name: suitable(g, volume.spacing, inside, boundary) for name, g in metrics.items()}
+        description["time_units"] = {name: unit_of_times(volume, name) for name in metrics}
     return description
 
 
@@ -124,17 +141,19 @@ def describe_mesh(path: Path, mesh: SimplicialMesh) -> dict[str, Any]:
     measure = float(np.sum(signed_measure(vertices, cells)[0])) / math.factorial(d)
     sides = [vertices[cells[:, i]] - vertices[cells[:, j]] for i, j in combinations(range(d + 1), 2)]
     edge = float(np.median(np.linalg.norm(np.concatenate(sides), axis=1)))
-    size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    size, rim = float(np.linalg.norm(np.ptp(vertices, axis=0))), mesh.triangulation.boundary_vertices
+    used = mesh.triangulation.used
+    depth = float(np.median(cKDTree(vertices[rim]).query(vertices[used])[0])) if rim.any() else math.inf
     return {
         "sha256": digest(path),
         "format": path.suffix,
         "vertices": len(vertices),
         WORDS[d].simplices: len(cells),
-        "boundary_vertices": int(mesh.triangulation.boundary_vertices.sum()),
+        "boundary_vertices": int(rim.sum()),
         "components": mesh.triangulation.labels[1],
         WORDS[d].measure: measure,
         "median_edge": edge,
-        "suits": {{2: "surface", 3: "solid"}[d]: suitable_times(d, measure, edge**2, size, len(vertices))},
+        "suits": {{2: "surface", 3: "solid"}[d]: suitable_times(d, measure, edge**2, size, len(vertices), depth=depth)},
     }
 
 
@@ -154,6 +173,7 @@ def _lines(description: dict[str, Any]) -> list[str]:
         lines += [f"{name:<18}{_plain(value)}" for name, value in facts.items()]
     else:
         bad, sizes = description["not_positive_definite"], ", ".join(map(str, description["component_sizes"]))
+        singular, least = description["nearly_singular"], description["least_admissible_eigenvalue"]
         length = f" {description['length_unit']}" if description["length_unit"] else ", without a declared unit"
         placed = "without an affine" if description["affine"] is None else "with an affine"
         lines += [
@@ -180,27 +200,40 @@ def _lines(description: dict[str, Any]) -> list[str]:
             )
         elif bad:
             lines[-1] += ": see --repair"
+        if singular:
+            lines.append(
+                f"                {singular} tensors are nearly singular, with an eigenvalue below {least:.3g}, a "
+                "hundredth of the median mean diffusivity, which no tissue has: see --repair"
+            )
+        if bad or singular:
+            lines.append("                k and t below are those of the other tensors")
         if description["not_symmetric"]:
             lines.append(f"                {description['not_symmetric']} tensors are not symmetric")
     in_mm, unit = description.get("length_unit") == "mm", description.get("unit", "")
     if in_mm and not unit:
         known = is_plausible(description.get("median_mean_diffusivity", 0.0))
         unit = f"{MM2_PER_S} (assumed)" if known else "(unit not declared)"
-    time = " s" if in_mm and unit.startswith(MM2_PER_S) else ""
     if "eigenvalues" in description:
         e = description["eigenvalues"]
         lines += [
             f"eigenvalues     {e['least']:.3g} … {e['largest']:.3g}, median {e['median']:.3g} {unit}".rstrip(),
             f"diffusivity     {description['median_mean_diffusivity']:.3g} {unit}".rstrip()
-            + ", the median of the tensors' mean eigenvalues",
+            + ", the median of the tensors' mean eigenvalues, the D of √(Dt)",
         ]
     lines += [f"question        {question}" for question in description.get("questions", ())]
     for name, s in description.get("suits", {}).items():
         worth = s["k_for_least_time"] <= s["unknowns"] / 4
         takes = f"k ≈ {s['k_for_least_time']}" if worth else "too many eigenpairs; see --method auto"
-        of = time if name == "inverse" else ""
+        keys = ("least_time", "least_time_of_k", "largest_time")
+        length = "" if name != "inverse" else f" {description['length_unit'] or ''}".rstrip()
+        mean = description.get("median_mean_diffusivity") if name == "inverse" else None
+        lengths = None if mean is None else [math.sqrt(mean * s[key]) for key in keys]
+        unit_of_t = description.get("time_units", {}).get(name, "")
+        first, own, last = times_in_words([s[key] for key in keys], lengths, unit_of_t, length.strip())
         lines.append(
-            f"metric {name:<8} t ≥ {s['least_time']:.3g}{of} for a discretisation error of 1 % (needs {takes}); "
-            f"t ≥ {s['least_time_of_k']:.3g}{of} for k = {s['k']}; t ≤ {s['largest_time']:.3g}{of} by the domain's size"
+            f"metric {name:<8} t ≥ {first} for a discretisation error of 1 % (needs {takes}); t ≥ {own} for "
+            f"k = {s['k']}; t ≤ {last}, at which about half of the nodes are free of the boundary"
         )
+        if name == "inverse":
+            lines.append("operator fick   the same t and k as for the metric inverse")
     return lines

@@ -21,14 +21,13 @@ from hks_jax.cli.reading import read_volume
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result
 from hks_jax.io.volume import require_position
+from hks_jax.signatures.times import FREE
 from hks_jax.uncertainty.propagate import LEAST
 
 _CANDIDATES = 4
 """The number of candidate times for each automatic time."""
 _SIGNAL = 1.0
 """The signal-to-noise ratio at which automatic times begin."""
-_RIM = 0.1
-"""The influence of the boundary on the signature (`boundary_influence`) below which a node is in the interior."""
 _LEAST = 0.1
 """The least share of nodes in the interior; fewer nodes do not represent the variation of a map."""
 _CLEAR = 2.0
@@ -70,11 +69,8 @@ def signature_of(args: argparse.Namespace, solved: Solved, noise: hj.TensorNoise
     if noise is None:
         return of_pairs(settings, progress)
 
-    def metric(D: Any) -> Any:
-        assert settings.metric is not None
-        return hj.TensorField.from_diffusion(field.grid, D, settings.metric, interpolation=settings.interpolation)
-
-    return with_error_bars(args, of_pairs, Noisy(volume.tensors, noise, metric), pairs, settings, progress)
+    noisy = Noisy(volume.tensors, noise, partial(settings.field, field.grid))
+    return with_error_bars(args, of_pairs, noisy, pairs, settings, progress)
 
 
 def with_error_bars(
@@ -102,8 +98,29 @@ def with_error_bars(
         "claimed": np.asarray(bars.trusted).tolist(),
         f"exceeds_{_CLEAR:g}_from_t": float(times[clear[0]]) if clear.size else None,
     }
-    arrays = {"deviation": np.asarray(bars.deviation), "bias": np.asarray(bars.bias), "noise_maps": maps}
+    for line in _told(ratio, times, result.unit):
+        progress.note(line)
+    # With a normalisation by the whole domain, the level of a map depends on the domain's volume, which differs from
+    # that of constant tensors. Then only differences between nodes are compared.
+    by_domain = settings.normalisation in ("heat-trace", "volume")
+    axes = tuple(range(1, bars.value.ndim))
+    level = jnp.nanmedian(bars.value - bars.null, axis=axes, keepdims=True) if by_domain else 0.0
+    z = bars.z(bars.null + level)
+    arrays = {"deviation": bars.deviation, "bias": bars.bias, "z": z, "noise_maps": maps}
+    arrays = {**result.arrays, **{name: np.asarray(array) for name, array in arrays.items()}}
     return replace(result, arrays=arrays, report={**result.report, "noise": report})
+
+
+def _told(ratio: np.ndarray, times: tuple[float, ...], unit: str) -> list[str]:
+    """Return lines with the signal-to-noise ratio at each t, and with the times at which there is no signal."""
+    at = [f"t = {t:.4g} {unit}".rstrip() for t in times]
+    known = [f"{r:.2g} at {where}" for r, where in zip(ratio, at, strict=True) if np.isfinite(r)]
+    lines = [f"signal-to-noise ratio: {', '.join(known)}"] if known else []
+    if none := [where for r, where in zip(ratio, at, strict=True) if r == 0]:
+        lines.append(f"noise explains all differences from constant tensors at {', '.join(none)}")
+    if unknown := [where for r, where in zip(ratio, at, strict=True) if not np.isfinite(r)]:
+        lines.append(f"no signal-to-noise ratio at {', '.join(unknown)}: the boundary influences nearly all nodes")
+    return lines
 
 
 def noise_of_volume(
@@ -156,7 +173,7 @@ def _error_bars(
         interior = np.isfinite(np.asarray(bars.value))
         if len(pairs.pencil.parts) == 2:
             nodes = interior[0].sum()
-            interior &= np.asarray(hj.boundary_influence(pairs, times)) < _RIM
+            interior &= np.asarray(hj.boundary_influence(pairs, times)) < FREE
             interior[interior.reshape(len(times), -1).sum(axis=1) < _LEAST * nodes] = False
     chosen = np.arange(len(times))
     if not settings.times.explicit:

@@ -29,16 +29,20 @@ file FILE...
 [metric] the metric
 --metric tensor|inverse|adjugate
     the metric that is made of the diffusion tensors D. inverse: D⁻¹, in which two points are near if water diffuses
-    quickly between them, as along a fibre; t is then the time of diffusion, in s for D in mm2/s and voxels in mm. This
-    is the usual choice for diffusion MRI. tensor: D itself, in which points are near if diffusion is slow. adjugate:
-    |D|D⁻¹, which is D⁻¹ times the determinant of D. The option is required except for NumPy's files without a unit of
-    length, whose tensors are the metric by default
+    quickly between them, as along a fibre; t is then a time, in s for D in mm2/s and voxels in mm. This is the usual
+    choice for the geometry of diffusion MRI. tensor: D itself, in which points are near if diffusion is slow. adjugate:
+    |D|D⁻¹, which is D⁻¹ times the determinant of D. Without --operator fick, the option is required except for NumPy's
+    files without a unit of length, whose tensors are the metric by default
+--operator laplace-beltrami|fick = laplace-beltrami
+    laplace-beltrami: the operator of the metric (default), which does not depend on coordinates; for D⁻¹ it differs
+    from the diffusion of a substance where the determinant of D varies. fick: the diffusion of a substance by Fick's
+    law, div(D∇u), whose density becomes uniform in space; it takes no --metric, and t is a time as for inverse
 [voxels] voxels
 --slice AXIS=N  one slice, such as z=14, instead of the volume
 --mask FILE  zeros and ones in NIfTI, MRtrix, NRRD, .npy, or in the array 'mask' of an .npz
 --background outside|inside
     without --mask, whether voxels that a program filled with equal isotropic tensors, or with tensors near zero, are
-    outside or inside the domain (default: inside, with a warning; zero tensors are always outside)
+    outside or inside the domain (default: inside, with a warning). Zero tensors are outside, except with --positive
 --erode N = 0  remove N layers of voxels from the boundary of the mask
 [numbers] meaning of the numbers: needed only if the file does not declare it. Wrong axes mirror the tensors.
 --order ORDER  order of the components
@@ -59,14 +63,16 @@ file FILE...
 --positive HOW:NUMBER
     map for tensors T that are naturally indefinite, such as stress: exp:S uses exp(T/S) and shift:C uses T + C·I as the
     metric; combine it with --metric tensor
-[dwi] diffusion-weighted images: DIPY fits the tensors. Without --mask, DIPY's median_otsu finds the brain.
+[dwi] diffusion-weighted images: a fit gives the tensors. Without --mask, DIPY's median_otsu finds the brain.
 --bval FILE  b-values, in s/mm2 unless --unit is given
 --bvec FILE
     gradient directions of length 1 in three rows or three columns, as dcm2niix writes them (see --bvec-frame)
 --bvec-frame fsl|voxel|world
     axes of the directions: the voxel axes, the first reversed if the affine's determinant is positive (fsl, the
     default, for FSL, dcm2niix and BIDS), the voxel axes (voxel), or the scanner's axes (world, for MRtrix)
---b-max B  largest b-value used, in s/mm2; the tensor model holds for b ≲ 1500
+--b-max B
+    largest b-value used, in s/mm2 (default: all are used, with a warning above 1500, up to which the tensor model
+    holds)
 [domain]
 --components raise|largest|all = raise
     if the mask is not connected: raise an error (default), keep the largest component, or keep all components
@@ -89,9 +95,12 @@ file FILE...
 --solver SOLVER = auto  eigensolver
 [signature] the signature
 --times T...
-    positive numbers, in s for --metric inverse; or auto, or auto:N for N times that suit the eigenvalues, the last when
-    √t is a third of the length of the domain (default auto:6). 'hks-jax info FILE' shows suitable times
---normalisation raw|heat-trace|volume|flat = raw  normalisation of the signature
+    positive numbers, in s for --metric inverse and --operator fick of tensors in mm2/s; or auto, or auto:N for N times
+    from the first that the eigenpairs resolve to the time at which half of the nodes are free of the boundary
+    (influence below 10 %), at least a factor of 2 apart (default auto:6). 'hks-jax info FILE' shows suitable times
+--normalisation raw|heat-trace|volume|flat = flat
+    normalisation of the signature: flat is (4πt)^(d/2)·HKS, which is 1 for flat space (default), raw is HKS itself,
+    volume is HKS times the volume of the domain, and heat-trace is HKS divided by its integral
 --method spectral|spectrum-free|auto = spectral
     method: a sum over eigenpairs (default), a computation without eigenpairs, or a choice by t, k and the spacing. For
     auto, the report lists the times of each method and their agreement
@@ -99,7 +108,7 @@ file FILE...
 --noise NOISE
     noise of the tensors, for error bars: a number relative to the mean diffusivity, such as 0.1; residuals, for the
     residuals of the fit to diffusion-weighted images; a second FILE of tensors, from another scan of the subject; or
-    roughness, for differences of neighbouring voxels. The option adds deviation and bias to the .npz, the
+    roughness, for differences of neighbouring voxels. The option adds deviation, bias and z to the .npz, the
     signal-to-noise ratio at each t to the report, the column error to tables of regions, and fades parts of the picture
     that noise may explain. Automatic times of a single subject begin at a sufficient signal-to-noise ratio
 --draws N = 8  number of noisy maps from which error bars are computed
@@ -117,6 +126,10 @@ file FILE...
 --view neurological|radiological = neurological
     orientation of pictures of a volume with an affine: neurological, left on the left (default), or radiological, left
     on the right. Front and head are at the top or on the right, for any storage order of the voxels
+[rim]
+--show-rim
+    draw the nodes near the boundary without hatching. Pictures hatch the nodes at which the boundary contributes over
+    10 % of the signature, where the shape of the domain shows and not curvature
 [common]
 --json  print a summary as JSON instead of the names of the files
 -q,--quiet  show no progress
@@ -283,5 +296,5 @@ def add_command(subparsers: Any, command: ModuleType) -> argparse.ArgumentParser
     # A word that begins with a minus and a digit is a point, such as -20,35, and not an option.
     parser._negative_number_matcher = re.compile(r"-[\d.]")
     add_options(parser, f"{command.OPTIONS}\n@common")
-    parser.set_defaults(run=command.run, prog=parser.prog, **getattr(command, "DEFAULTS", {}))
+    parser.set_defaults(run=command.run, command=command, prog=parser.prog, **getattr(command, "DEFAULTS", {}))
     return parser

@@ -1,4 +1,4 @@
-"""Write the files of a command, all or none, and print its summary."""
+"""Write the files of a command, all or none, then its pictures, and print its summary."""
 
 import argparse
 import importlib.metadata
@@ -17,12 +17,16 @@ import numpy as np
 from hks_jax.cli.progress import Progress
 from hks_jax.io.result import Result, plain
 from hks_jax.io.tables import write_json
-from hks_jax.storage import atomic_folder
+from hks_jax.storage import atomic_folder, atomic_path
 
 REPORT = "report.json"
 PAIRS = "pairs.npz"
 """The name of the file of saved eigenpairs."""
 _OPTIONAL = ("nibabel", "dipy", "pynrrd", "vtk", "meshio")
+
+
+class PictureError(RuntimeError):
+    """The error for a picture that cannot be drawn, although the results are complete."""
 
 
 class Done(NamedTuple):
@@ -44,28 +48,58 @@ def show(args: argparse.Namespace, done: Done) -> None:
 
 @contextmanager
 def writing(
-    folder: Path, report: Mapping[str, Any], progress: Progress, stale: Callable[[], Iterable[Path]] = tuple
+    folder: Path,
+    report: Mapping[str, Any],
+    progress: Progress,
+    stale: Callable[[], Iterable[Path]] = tuple,
+    pictures: Mapping[str, Callable[[Path], Any]] | None = None,
 ) -> Iterator[tuple[Path, Done]]:
     """Yield a temporary folder and a `Done`, to which the report and the paths of the results are added at the end.
 
     At the end, report.json is also written, all files are moved to `folder` atomically, and `stale` files are deleted.
+    The functions in `pictures`, by name of the file, draw afterwards, so that a failure leaves the results.
     """
-    done = Done([], {})
-    with progress.stage("writing", str(folder)), atomic_folder(folder, stale) as temporary:
+    done, pictures = Done([], {}), pictures or {}
+
+    def replaced() -> Iterable[Path]:
+        return {*stale(), *(folder / name for name in pictures)}
+
+    with progress.stage("writing", str(folder)), atomic_folder(folder, replaced) as temporary:
         yield temporary, done
         seconds = {stage: round(spent, 3) for stage, spent in progress.timings.items()}
         known = {"warnings": progress.warnings, "versions": versions(), "seconds": seconds}
         done.summary.update(plain({"command": sys.argv, **report, **known}))
         write_json(temporary / REPORT, done.summary)
-        done.files.extend(sorted(folder / file.name for file in temporary.iterdir()))
+        done.files.extend(folder / file.name for file in temporary.iterdir())
+    said = len(progress.warnings)
+    for name, draw in pictures.items():
+        with progress.stage("drawing", str(folder / name)):
+            draw_picture(folder / name, draw, done.files)
+        done.files.append(folder / name)
+    done.files.sort()
+    if len(progress.warnings) > said:
+        done.summary["warnings"] = list(progress.warnings)
+        write_json(folder / REPORT, done.summary)
+
+
+def draw_picture(path: Path, draw: Callable[[Path], Any], results: Iterable[Path]) -> None:
+    """Draw a picture of complete results; raise PictureError with the names of the results if this fails."""
+    try:
+        with atomic_path(path) as temporary:
+            draw(temporary)
+    except Exception as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        names = ", ".join(sorted(map(str, results)))
+        raise PictureError(
+            f"the picture {path} cannot be drawn ({reason}). The results are complete: {names}"
+        ) from error
 
 
 def write_outputs(folder: Path, result: Result, progress: Progress, draw: Callable[[Path], Any], image: str) -> Done:
-    """Write hks.npz, hks.png (by `draw`), report.json and, unless the suffix `image` is empty, an image."""
+    """Write hks.npz, report.json and, unless the suffix `image` is empty, an image; then hks.png, by `draw`."""
     stale = partial(of_earlier, folder, result.eigenvalues, progress)
-    with writing(folder, result.report, progress, stale) as (temporary, done):
+    with writing(folder, result.report, progress, stale, {"hks.png": draw}) as (temporary, done):
         result.save(temporary / "hks", image, {"command": sys.argv})
-        draw(temporary / "hks.png")
     return done
 
 

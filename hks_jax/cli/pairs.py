@@ -18,7 +18,7 @@ from hks_jax.io.result import plain, tuples
 from hks_jax.storage import load_npz
 
 _RECORD = "field_record"
-_SETTLED = ("metric", "interpolation", "boundary", "components", "solver", "dtype")
+_SETTLED = ("metric", "operator", "interpolation", "boundary", "components", "solver", "dtype")
 """Settings that the saved eigenpairs determine."""
 _ABOUT = ("order", "frame", "source", "digest", "notes", "repair")
 """The attributes of a volume that are saved as text."""

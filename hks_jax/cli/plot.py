@@ -4,12 +4,13 @@ Draw a result that 'hks-jax hks', 'fit' or 'curvature' has written as npz. The p
 with --points a curve over the times for each point.
 
 examples:
-  hks-jax plot out/hks.npz -o panels.png --times auto:4 --quantiles 0.02,0.9 --unit s
-  hks-jax plot out/hks.npz -o curves.pdf --points -22,5 24,5 --unit s --scaled
+  hks-jax plot out/hks.npz -o panels.png --times auto:4 --quantiles 0.02,0.9
+  hks-jax plot out/hks.npz -o curves.pdf --points -22,5 24,5
 """
 
 import argparse
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,14 +35,19 @@ result RESULT  the result, as an .npz or the folder of a signature
 --quantiles Q,Q = 0,1  quantiles of the values at the two ends of an own or shared range of colours
 --cmap NAME  colour map of matplotlib (default: viridis, or colours that diverge from 1 if 1 means flat space)
 --scaled  draw (4πt)^(d/2)·HKS, which is 1 for flat space (with --normalisation flat, this is always drawn)
---unit TEXT  unit of t
+--unit-of-t TEXT  unit of t, if the result does not have it (default: that of the result)
 --title TEXT  title of the picture
 --dpi DPI = 150  pixels per inch
-@view
+@view @rim
 """
 
 MANY = 12
 """The largest number of images, unless times are chosen."""
+
+
+def writes(args: argparse.Namespace) -> list[Path]:
+    """Return the files that the command may write."""
+    return [args.output]
 
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
@@ -62,10 +68,14 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
             "times and the normalisation raw or flat. Leave this option out"
         )
     chosen = _choose_times(result, args)
-    result = replace(result, values=result.values[chosen], times=result.times[chosen[: result.times.size]])
+    influence = {n: a[chosen] for n, a in result.arrays.items() if n == "influence"}
+    arrays = {**result.arrays, **influence}
+    result = replace(
+        result, values=result.values[chosen], times=result.times[chosen[: result.times.size]], arrays=arrays
+    )
     if args.scaled and result.normalisation == "raw":
         settings = {**result.settings, "normalisation": "flat"}
-        result = replace(result, values=result.values * result.flat_scale, report={"settings": settings})
+        result = replace(result, values=result.values * result.to_flat, report={"settings": settings})
     save_figure(_panels(result, args) if args.points is None else _curves(result, args), args.output, dpi=args.dpi)
     ends = {"least": float(np.nanmin(result.values)), "greatest": float(np.nanmax(result.values))}
     summary = {"source": str(args.result), "times": result.times.tolist(), "values": ends}
@@ -93,15 +103,19 @@ def _choose_times(result: Result, args: argparse.Namespace) -> np.ndarray:
 
 def _panels(result: Result, args: argparse.Namespace) -> Any:
     from hks_jax.plot import hks_panels, middle_node
-    from hks_jax.plot.signature import LEAST_RANGE, caption, cropped, placed, titles_of
+    from hks_jax.plot.signature import LEAST_RANGE, caption, cropped, legend, placed, titles_of
 
     signature = result.name == "hks"
     values, volume, title = result.values, result.volume, args.title or (caption(result) if signature else "")
+    near = result.near_rim if signature and not args.show_rim else None
+    if signature and not args.title:
+        title = "\n".join([title, *legend(result, near)])
     if volume.dimension == 3:
         axis, index = args.slice or ("z", middle_node(result.grid.inside)[2])
         volume = sliced(volume, axis, index)
         values = values.take(index, 1 + "xyz".index(axis))
-        title = f"{title}, slice {axis} = {index}".lstrip(", ")
+        near = None if near is None else near.take(index, 1 + "xyz".index(axis))
+        title = f"slice {axis} = {index}: {title}".rstrip(": ")
     else:
         refuse(args, ("slice",), f"{args.result} is a slice, with two axes; leave this option out")
     drawn = volume.inside & np.isfinite(values).all(axis=0)
@@ -110,13 +124,12 @@ def _panels(result: Result, args: argparse.Namespace) -> Any:
     plane, box = cropped(volume, drawn)
     vmin, vmax = (None, None) if isinstance(args.range, str) else args.range
     around_one = signature and result.normalisation == "flat" and args.cmap is None and vmin is None
-    titles = titles_of(result) if signature and not args.unit else None
+    titles = titles_of(result, args.unit_of_t) if signature else None
     return hks_panels(
         np.where(drawn, values, np.nan)[:, *box],
         result.times if result.times.size else [0.0],
         plane,
         titles=titles if result.times.size else [args.array or args.result.stem],
-        unit=args.unit or "",
         shared_range=args.range == "shared",
         cmap=args.cmap,
         centre=1.0 if around_one else None,
@@ -125,6 +138,7 @@ def _panels(result: Result, args: argparse.Namespace) -> Any:
         quantiles=args.quantiles,
         least_range=LEAST_RANGE,
         suptitle=title,
+        hatched=None if near is None else near[:, *box],
         orientation=placed(volume, box, args.view),
     )
 
@@ -140,7 +154,7 @@ def _curves(result: Result, args: argparse.Namespace) -> Any:
         values, grid = orientation.array(values), orientation.grid(grid)
     if any(len(point) != d for point in args.points):
         raise ValueError(f"--points: got {args.points}; expected {d} coordinates per point")
-    style: dict[str, Any] = {"scaled": flat, "cmap": args.cmap or "viridis", "unit": args.unit or result.unit}
+    style: dict[str, Any] = {"scaled": flat, "cmap": args.cmap or "viridis", "unit": args.unit_of_t or result.unit}
     if result.smallest_time:
         style["limit"] = result.smallest_time
     figure = new_figure(5.4, 4.0)

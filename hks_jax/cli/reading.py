@@ -17,14 +17,26 @@ from hks_jax.io.units import unit_question
 
 
 def require_metric(args: argparse.Namespace, volume: TensorVolume | None = None) -> None:
-    """Raise ValueError if the file has diffusion tensors and no metric is chosen.
+    """Raise ValueError if the file has diffusion tensors and neither metric nor Fick's operator is chosen, or both.
 
     Of NumPy's files, only those with lengths in mm have diffusion tensors, which `volume` shows after the file is read.
     """
-    if args.metric is None and (format_of(args.file).image if volume is None else volume.length_unit):
+    if args.operator == "fick":
+        require_one(args)
+    elif args.metric is None and (format_of(args.file).image if volume is None else volume.length_unit):
         raise ValueError(
-            "--metric: choose the metric of the diffusion tensors D: inverse (D⁻¹, for Brownian motion with "
-            "diffusivity D), tensor (D itself) or adjugate (|D|D⁻¹)"
+            "--metric: choose the metric of the diffusion tensors D: inverse (D⁻¹, in which points are near if "
+            "diffusion is fast), tensor (D itself) or adjugate (|D|D⁻¹); or pass --operator fick (diffusion by Fick's "
+            "law)"
+        )
+
+
+def require_one(args: argparse.Namespace) -> None:
+    """Raise ValueError for a metric beside Fick's operator."""
+    if args.operator == "fick" and args.metric is not None:
+        raise ValueError(
+            f"--metric: got {args.metric} with --operator fick, whose metric is D⁻¹. Leave out --metric, or use "
+            "--operator laplace-beltrami"
         )
 
 
@@ -50,27 +62,19 @@ def read(args: argparse.Namespace, progress: Progress, ask: Callable[[str], None
         if mask is not None and mask.shape == volume.shape:
             volume, mask = volume.with_mask(mask), None
         if mask is None:  # the background would distort the checks of units and frames
-            volume = _without_filling(without_background(volume), args.background, progress)
+            volume = _without_filling(volume, args, progress)
         volume = _reviewed(volume, args, progress.warn if ask is None else ask)
         if args.slice is not None:
             volume = sliced(volume, *args.slice)
         if mask is not None:  # the mask may have the shape of the slice
             if mask.shape != volume.shape:
                 raise ValueError(f"--mask: got shape {mask.shape}; expected the shape of the tensors, {volume.shape}")
-            volume = without_background(volume.with_mask(mask))
+            volume = volume.with_mask(mask)
         if args.erode:
             volume = volume.with_mask(erode(volume.inside, args.erode))
         volume = _repaired(volume, args)
     for note in volume.notes:
         progress.note(as_options(note))
-    if args.bval is not None:
-        values = np.linalg.eigvalsh(volume.tensors[volume.inside])
-        if clipped := int((values[:, 0] < 0.01 * np.median(values.mean(axis=-1))).sum()):
-            progress.warn(
-                f"{clipped} tensors in the mask have an eigenvalue near zero, because DIPY clips fits that are not "
-                "positive definite. At such voxels, distances in the metric D⁻¹ are very large. --erode 1 removes "
-                "boundary voxels, and --repair nearest:1e-4 replaces the tensors"
-            )
     return volume
 
 
@@ -103,12 +107,17 @@ def _load(args: argparse.Namespace) -> tuple[TensorVolume, np.ndarray | None]:
     return fit_dwi(*files, args.b_max, unit=args.unit, noise=noise, **axes), None
 
 
-def _without_filling(volume: TensorVolume, background: str | None, progress: Progress) -> TensorVolume:
-    """Exclude the background if ``--background outside`` is given; without the option, warn of a background."""
-    found = None if background == "inside" else find_background(volume)
+def _without_filling(volume: TensorVolume, args: argparse.Namespace, progress: Progress) -> TensorVolume:
+    """Exclude the background if ``--background outside`` is given; without the option, warn of a background.
+
+    Zero tensors are always background, except with ``--positive``: zero is a valid stress.
+    """
+    if args.positive is None or args.background == "outside":
+        volume = without_background(volume)
+    found = None if args.background == "inside" else find_background(volume)
     if found is None:
         return volume
-    if background is None:
+    if args.background is None:
         progress.warn(f"{found[1]}. Pass --mask or --background outside, or --background inside to include them")
         return volume
     note = found[1].replace("count as inside", "are left out, as asked")

@@ -1,7 +1,7 @@
 """Compare eigenvalues with Weyl's law.
 
-Compute the lowest eigenvalues of the Laplace-Beltrami operator of a field of diffusion tensors. FILE is read as in
-'hks-jax hks'.
+Compute the lowest eigenvalues of the Laplace-Beltrami operator, or of Fick's operator, of a field of diffusion
+tensors. FILE is read as in 'hks-jax hks'.
 
 The command writes to the folder OUT: spectrum.csv and spectrum.npz (eigenvalues, residuals, and the counts of
 eigenvalues by Weyl's law), spectrum.png and report.json. The default boundary condition is neumann even for a mask,
@@ -15,13 +15,16 @@ examples:
 import argparse
 import csv
 from dataclasses import asdict
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from hks_jax import Eigenpairs, TensorField
 from hks_jax.cli.computation import Settings, compute_pairs, describe_input, describe_pairs
 from hks_jax.cli.options import READING, SOLVING
-from hks_jax.cli.outputs import Done, writing
+from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read_volume
 from hks_jax.eigen.weyl import weyl_count
@@ -29,10 +32,13 @@ from hks_jax.eigen.weyl import weyl_count
 OPTIONS = f"@file @metric {READING} @output {SOLVING}"
 
 
+def writes(args: argparse.Namespace) -> list[Path]:
+    """Return the files that the command may write."""
+    return [args.output / name for name in ("spectrum.csv", "spectrum.npz", "spectrum.png", REPORT)]
+
+
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
-    from hks_jax.plot import new_figure, save_figure, spectrum
-
     volume = read_volume(args, progress)
     settings = Settings.of(args, boundary=args.boundary or "neumann")
     solved = compute_pairs(volume, settings, progress)
@@ -51,16 +57,24 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         "volume": np.asarray(pairs.pencil.volume).item(),
         "eigenvalues": columns["eigenvalues"].tolist(),
     }
-    with writing(args.output, report, progress) as (folder, done):
+    with writing(args.output, report, progress, pictures={"spectrum.png": partial(_draw, pairs, field)}) as (
+        folder,
+        done,
+    ):
         np.savez_compressed(folder / "spectrum.npz", **columns)
         with open(folder / "spectrum.csv", "w", newline="", encoding="utf-8") as stream:
             writer = csv.writer(stream)
             writer.writerow(["index", *(name.removesuffix("s") for name in columns)])
             rows = zip(*(column.tolist() for column in columns.values()), strict=True)
             writer.writerows([i, *row] for i, row in enumerate(rows))
-        figure = new_figure(9.0, 3.8)
-        counts, remainder = figure.subplots(1, 2)
-        spectrum(counts, pairs, field)
-        spectrum(remainder, pairs, field, remainder=True)
-        save_figure(figure, folder / "spectrum.png")
     return done
+
+
+def _draw(pairs: Eigenpairs, field: TensorField, path: Path) -> None:
+    from hks_jax.plot import new_figure, save_figure, spectrum
+
+    figure = new_figure(9.0, 3.8)
+    counts, remainder = figure.subplots(1, 2)
+    spectrum(counts, pairs, field)
+    spectrum(remainder, pairs, field, remainder=True)
+    save_figure(figure, path)

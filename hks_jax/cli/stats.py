@@ -20,13 +20,16 @@ from typing import Any
 import numpy as np
 
 from hks_jax import __version__
+from hks_jax.cli.computation import HALF
 from hks_jax.cli.outputs import Done
 from hks_jax.cli.progress import Progress
 from hks_jax.io.masks import names_beside, read_labels, read_names
 from hks_jax.io.result import Result, signature_file
 from hks_jax.io.tables import write_table
+from hks_jax.io.units import MEDIAN
 from hks_jax.io.volume import digest
 from hks_jax.signatures.regions import region_statistics
+from hks_jax.signatures.times import FREE
 
 OPTIONS = """
 result RESULT  the folder OUT that 'hks-jax hks' wrote, or an .npz from there
@@ -36,17 +39,26 @@ result RESULT  the folder OUT that 'hks-jax hks' wrote, or an .npz from there
 """
 
 _SCALES = {
-    "raw": "the heat kernel signature, per (metric length)^d",
+    "raw": "the heat kernel signature, per (metric length)^d, or per length^d for Fick's operator",
     "heat-trace": "the heat kernel signature divided by the heat trace",
-    "volume": "the heat kernel signature times the domain's volume in the metric",
-    "flat": "(4πt)^(d/2) times the heat kernel signature, which is 1 for flat space",
+    "volume": "the heat kernel signature times the domain's volume in the metric, or in space for Fick's operator",
+    "flat": "(4πt)^(d/2) times the heat kernel signature, times √|D| for Fick's operator, which is 1 for flat space",
 }
+
+
+def writes(args: argparse.Namespace) -> list[Path]:
+    """Return the files that the command may write."""
+    table = _table(args)
+    return [table, table.with_suffix(".json")]
+
+
+def _table(args: argparse.Namespace) -> Path:
+    return args.output or signature_file(args.result).with_name("regions.tsv")
 
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
-    source = signature_file(args.result)
-    table = args.output or source.with_name("regions.tsv")
+    source, table = signature_file(args.result), _table(args)
     if table.suffix.lower() != ".tsv":
         raise ValueError(f"--output: got {table}; expected a name that ends in .tsv")
     with progress.stage("regions", f"{args.atlas} on {source}"):
@@ -90,6 +102,18 @@ def region_table(
     cells = {name: np.tile(of, n_regions) for name, of in by_time.items() if of is not None}
     cells |= {name: np.repeat(of, n_times) for name, of in by_region.items()}
     cells |= {"mean": regions.mean.T.ravel(), "std": regions.deviation.T.ravel(), "median": regions.median.T.ravel()}
+    if (
+        near := result.near_rim
+    ) is not None:  # the labels' nodes with and without influence of the boundary, at each time
+        share = region_statistics(np.where(np.isfinite(values), ~near, np.nan), labels).mean
+        cells["free_of_rim"] = share.T.ravel()
+        if late := int((share < HALF).any(axis=0).sum()):
+            progress.warn(
+                f"in {late} of {n_regions} regions, the boundary contributes over {100 * FREE:.0f} % of the signature "
+                "at most voxels at some t (column free_of_rim); the mean then shows the shape of the domain"
+            )
+    if result.lengths is not None:
+        cells["length"] = np.tile(result.lengths, n_regions)
     if "noise_maps" in result.arrays:  # a regional mean's error is the root mean square of the noisy maps' means
         draws = [region_statistics(one, labels).mean for one in result.arrays["noise_maps"]]
         cells["error"] = np.sqrt(np.mean(np.square(draws), axis=0)).T.ravel()
@@ -103,7 +127,7 @@ def _about(result: Result, atlas: Path, names: Path | None) -> dict[str, Any]:
     """Return the sidecar: descriptions of the table's columns in order, and (capitalised) the origin of the table."""
     settings = result.settings
     flat = result.volume.dimension == 2 and result.volume.affine is None
-    values = _SCALES.get(settings.get("normalisation", "raw"), "the heat kernel signature")
+    values = _SCALES.get(result.normalisation, "the heat kernel signature")
     unit = {"Units": result.unit} if result.unit else {}
     return {
         "index": {"Description": "number of the region in the label map"},
@@ -115,7 +139,18 @@ def _about(result: Result, atlas: Path, names: Path | None) -> dict[str, Any]:
             "image (NIfTI: mm); a slice is one voxel thick"
         },
         "lambda1_t": {"Description": "t times the first positive eigenvalue, equal for all subjects"},
-        "t": {"Description": "time in (metric length)²; in s for the metric D⁻¹ with D in mm²/s", **unit},
+        "t": {
+            "Description": "time in (metric length)², in s for D in mm²/s with the metric D⁻¹ or Fick's operator",
+            **unit,
+        },
+        "length": {
+            "Description": f"√(Dt), where D is {MEDIAN}",
+            **({"Units": result.length_unit} if result.length_unit else {}),
+        },
+        "free_of_rim": {
+            "Description": "share of these voxels at which the boundary contributes less than "
+            f"{100 * FREE:.0f} % of the signature"
+        },
         "mean": {"Description": f"mean over the region's voxels in the domain: {values}"},
         "std": {"Description": "standard deviation over the same voxels (the root of the mean square deviation)"},
         "median": {"Description": "median over the same voxels"},
@@ -123,5 +158,5 @@ def _about(result: Result, atlas: Path, names: Path | None) -> dict[str, Any]:
         "GeneratedBy": {"Name": "hks-jax", "Version": __version__},
         "LabelMap": {"File": atlas.name, "SHA256": digest(atlas)},
         "Names": None if names is None else {"File": names.name, "SHA256": digest(names)},
-        "Settings": {name: settings.get(name) for name in ("metric", "boundary", "normalisation", "k")},
+        "Settings": {name: settings.get(name) for name in ("metric", "operator", "boundary", "normalisation", "k")},
     }

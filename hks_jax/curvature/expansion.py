@@ -25,7 +25,7 @@ from hks_jax.curvature.jet import (
 )
 from hks_jax.curvature.noise import warn_of_noise
 from hks_jax.domain.components import wraps_per_axis
-from hks_jax.domain.tensor_field import TensorField, require_field
+from hks_jax.domain.tensor_field import TensorField, require_field, require_laplace_beltrami
 from hks_jax.traced import is_traced
 
 Coefficients: TypeAlias = list[Array]
@@ -72,8 +72,8 @@ def hks_expansion(
         periodic: whether the axes are periodic; one value for all axes, or one per axis.
 
     Raises:
-        ValueError: times that are not a vector of positive numbers; an order that is not implemented; fewer than 7
-            nodes along an axis of a nodal field (11 and 13 for u₂ and u₃ on a surface); a bad `periodic`.
+        ValueError: Fick's operator; times that are not a vector of positive numbers; an order that is not implemented;
+            fewer than 7 nodes along an axis of a nodal field (11 and 13 for u₂ and u₃ on a surface); a bad `periodic`.
 
     Examples:
         >>> expansion = hj.hks_expansion(hj.examples.sphere_field(9), [0.1], order=1)[0, 4, 4]
@@ -81,6 +81,7 @@ def hks_expansion(
         1.033
     """
     require_field(field)
+    require_laplace_beltrami(field, "the expansion in curvature")
     dimension = field.grid.dimension
     highest = HIGHEST_ORDER[dimension]
     order = highest if order is None else order

@@ -23,7 +23,7 @@ from hks_jax.curvature.jet import (
 from hks_jax.curvature.noise import warn_of_noise
 from hks_jax.domain import spd
 from hks_jax.domain.components import wraps_per_axis
-from hks_jax.domain.tensor_field import TensorField, require_field
+from hks_jax.domain.tensor_field import TensorField, require_field, require_laplace_beltrami
 
 
 @nan_is_meant
@@ -178,13 +178,15 @@ def laplace_beltrami(
         periodic: as in `gaussian_curvature`.
 
     Raises:
-        ValueError: values of another shape; fewer than 7 nodes along an axis of nodal values; a bad `periodic`.
+        ValueError: Fick's operator; values of another shape; fewer than 7 nodes along an axis of nodal values; a bad
+            `periodic`.
 
     Examples:
         >>> print(hj.laplace_beltrami(field, lambda x: (x + 0.3) @ (x + 0.3))[4, 4].round(3))  # of r²
         4.0
     """
     require_field(field)
+    require_laplace_beltrami(field, "∇²")
     if callable(f):
         f = f if isinstance(f, jtu.Partial) else jtu.Partial(f)
     else:

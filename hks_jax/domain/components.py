@@ -10,11 +10,12 @@ from jaxtyping import Bool, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from hks_jax.checks import require_real
+from hks_jax.checks import require_real, require_static
 
 
 def as_mask(name: str, values: Any) -> Bool[np.ndarray, "*shape"]:
     """Return a mask of zeros and ones as booleans; raise ValueError for other values."""
+    require_static(name, values)
     require_real(name, values)
     array = np.asarray(values)
     if array.dtype != bool and not np.isin(array, (0, 1)).all():
@@ -65,6 +66,13 @@ def element_nodes(elements: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarra
 def rim_nodes(elements: np.ndarray, periodic: tuple[bool, ...]) -> Bool[np.ndarray, "*shape"]:
     """Mark the nodes on the rim of a mask: nodes of the domain with an adjacent grid element outside the domain."""
     return element_nodes(elements, periodic) & element_nodes(~elements, periodic)
+
+
+def boundary_nodes(elements: np.ndarray, periodic: tuple[bool, ...]) -> Bool[np.ndarray, "*shape"]:
+    """Mark the nodes on the rim of a mask and on the sides of the grid that are not periodic."""
+    margins = [0 if wraps else 1 for wraps in periodic]
+    around = np.pad(elements, [(m, m) for m in margins])
+    return rim_nodes(around, periodic)[tuple(slice(m, -m or None) for m in margins)]
 
 
 def label_nodes(mask: Bool[np.ndarray, "*shape"], periodic: tuple[bool, ...]) -> tuple[Int[np.ndarray, "*shape"], int]:

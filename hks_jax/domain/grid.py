@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hks_jax.arrays import ByKey, StaticArray
-from hks_jax.checks import require_real
+from hks_jax.checks import require_real, require_static
 from hks_jax.domain.components import active_elements, as_mask, label_nodes
 
 
@@ -140,6 +140,7 @@ class Grid(ByKey):
 
 
 def _checked_shape(shape: Sequence[int]) -> tuple[int, ...]:
+    require_static("shape", shape)
     try:
         return tuple(operator.index(n) for n in shape)
     except TypeError:
@@ -150,6 +151,7 @@ def _checked_shape(shape: Sequence[int]) -> tuple[int, ...]:
 
 def per_axis(name: str, value: float | Sequence[float] | np.ndarray, dimension: int) -> tuple[float, ...]:
     """Return one finite number per axis; a single given number is used for all axes."""
+    require_static(name, value)
     require_real(name, value)
     try:
         values = np.asarray(value, dtype=np.float64)

@@ -8,6 +8,7 @@ import scipy
 from jaxtyping import Bool, Float, Int
 
 from hks_jax.accuracy import warn_of_accuracy
+from hks_jax.checks import require_static
 from hks_jax.domain.components import as_mask
 from hks_jax.domain.triangulation import Triangulation
 
@@ -39,7 +40,9 @@ def checked_cells(cells: Any, n_vertices: int, dimension: int, masked: bool) -> 
 
     Without a mask every vertex must belong to a simplex.
     """
-    words, indices = WORDS[dimension], np.asarray(cells)
+    words = WORDS[dimension]
+    require_static(words.argument, cells)
+    indices = np.asarray(cells)
     if indices.ndim != 2 or indices.shape[1] != dimension + 1 or not np.issubdtype(indices.dtype, np.integer):
         raise ValueError(
             f"{words.argument}: got shape {indices.shape}, dtype {indices.dtype}; expected integers of shape "
@@ -67,6 +70,7 @@ def checked_mask(
     Raises:
         ValueError: another shape; values other than 0 and 1; an ambiguous mask; a mask without a simplex.
     """
+    require_static("mask", mask)
     words, inside = WORDS[dimension], np.asarray(mask)
     if inside.shape not in ((n_vertices,), (len(cells),)):
         raise ValueError(

@@ -15,8 +15,9 @@ from hks_jax.domain.simplices import WORDS, check_metric, check_places, checked_
 from hks_jax.domain.tensor_checks import (
     Interpolation,
     MetricChoice,
-    check_metric_choice,
+    OperatorChoice,
     checked_interpolation,
+    of_diffusion,
     require_finite_symmetric,
     require_spd,
 )
@@ -28,11 +29,15 @@ Mesh = TypeVar("Mesh", bound="SimplicialMesh")
 
 
 class SimplicialMesh(eqx.Module):
-    """A mesh of triangles (`SurfaceMesh`) or tetrahedra (`TetMesh`) in space, with a constant metric on each cell."""
+    """A mesh of triangles (`SurfaceMesh`) or tetrahedra (`TetMesh`) in space, with a constant metric on each cell.
+
+    The operator is that of the metric, or Fick's if `from_tensors` was told so.
+    """
 
     vertices: Float[Array, "V 3"]
     triangulation: Triangulation = eqx.field(static=True)
     _mask: StaticArray | None = eqx.field(static=True)
+    operator: OperatorChoice = eqx.field(static=True)
     _metric: Float[Array, "n d d"] | None
     _dimension: ClassVar[int]
 
@@ -43,7 +48,7 @@ class SimplicialMesh(eqx.Module):
         cells = checked_cells(cells, len(positions), self._dimension, mask is not None)
         inside = None if mask is None else checked_mask(mask, cells, len(positions), self._dimension)
         self._mask = None if inside is None else StaticArray(inside)
-        self.vertices = positions
+        self.vertices, self.operator = positions, "laplace-beltrami"
         self.triangulation = triangulation = Triangulation(self.restrict(cells), len(positions))
         if not is_traced(positions):
             check_places(np.asarray(positions, np.float64), triangulation)
@@ -59,16 +64,20 @@ class SimplicialMesh(eqx.Module):
         tensors: Any,
         metric: MetricChoice | None = None,
         *,
+        operator: OperatorChoice = "laplace-beltrami",
         at: Literal["faces", "cells", "vertices"] | None = None,
         interpolation: Interpolation = "linear",
         mask: Any = None,
     ) -> Mesh:
-        """Return the mesh with a metric made of tensors D in space; a surface uses only their tangential parts.
+        """Return the mesh with a metric or with Fick's operator made of tensors D in space.
+
+        A surface uses only the tangential parts of the tensors.
 
         The tangential part of D is its quadratic form on the plane of a triangle. If D is a diffusion tensor, its
-        tangential part describes diffusion within the surface. The choice of the metric g has no default (see
-        `TensorField.from_diffusion`): ``"tensor"``, g = D; ``"inverse"``, g = D⁻¹; ``"adjugate"``, g = |D| D⁻¹. On a
-        surface, D in these formulas is the tangential part. If D is the identity, g is the Euclidean metric.
+        tangential part describes diffusion within the surface. The choice has no default (see
+        `TensorField.from_diffusion`): the metric ``"tensor"``, g = D; ``"inverse"``, g = D⁻¹; or ``"adjugate"``, g =
+        |D| D⁻¹; or no metric and ``operator="fick"``, which is div(D∇u) with the area or volume of space. On a surface,
+        D in these formulas is the tangential part. If D is the identity, g is the Euclidean metric.
 
         Tensors at vertices are interpolated to the centre of each cell: by the mean of the tensors at its vertices, or
         with ``"log-euclidean"`` by the exponential of the mean of their logarithms. Using one tensor per cell causes an
@@ -80,17 +89,20 @@ class SimplicialMesh(eqx.Module):
             tensors: one symmetric tensor per cell, (F, 3, 3) or (C, 3, 3), or per vertex, (V, 3, 3). The tensors must
                 be positive definite; on a surface, only their tangential parts must be.
             metric: ``"inverse"``, ``"tensor"`` or ``"adjugate"``.
+            operator: ``"laplace-beltrami"`` of the metric, or ``"fick"``.
             at: whether the tensors belong to ``"faces"`` (of a surface), ``"cells"`` (of a solid) or ``"vertices"``;
                 needed only if there are as many cells as vertices.
             interpolation: ``"linear"`` or ``"log-euclidean"``, for tensors at vertices; see `TensorField`.
             mask: the domain, as for the class; tensors outside are ignored.
 
         Raises:
-            ValueError: an unknown metric or interpolation; wrong shapes; tensors that are NaN, infinite, unsymmetric or
-                not positive definite (with their number and the first place); the errors that the class raises.
+            ValueError: an unknown metric, operator or interpolation; wrong shapes; tensors that are NaN, infinite,
+                unsymmetric or not positive definite (with their number and the first place); the errors that the class
+                raises.
         """
         mesh = cls(vertices, cells, mask=mask)
-        check_metric_choice(metric)
+        metric = of_diffusion(metric, operator)
+        object.__setattr__(mesh, "operator", operator)
         checked_interpolation(interpolation)
         array, edges, triangulation = real_array("tensors", mesh.restrict(tensors)), mesh._edges, mesh.triangulation
         at_vertices = _place(array.shape, triangulation, at) == "vertices"
@@ -106,7 +118,8 @@ class SimplicialMesh(eqx.Module):
     def __repr__(self) -> str:
         metric = "that of space" if self._metric is None else describe_array(self._metric)
         cells = f"{len(self.triangulation.cells)} {WORDS[self.triangulation.dimension].simplices}"
-        return f"{type(self).__name__}(vertices {describe_array(self.vertices)}, {cells}, metric {metric})"
+        operator = "" if self.operator == "laplace-beltrami" else f", operator={self.operator!r}"
+        return f"{type(self).__name__}(vertices {describe_array(self.vertices)}, {cells}, metric {metric}{operator})"
 
     def restrict(self, of_cells: Any) -> Any:
         """Remove the entries of cells outside the mask from an array (n, …), unless they are already removed."""
@@ -117,7 +130,9 @@ class SimplicialMesh(eqx.Module):
     @property
     def metric(self) -> Float[Array, "n d d"]:
         """The metric of each cell in the basis of its edges v₁ − v₀, v₂ − v₀ …; NaN if not positive definite."""
-        return _induced_metric(self._edges) if self._metric is None else spd.positive_or_nan(self._metric)
+        # The symmetric part is taken here, as in `TensorField.tensors`, because the leaf may change.
+        given = self._metric
+        return _induced_metric(self._edges) if given is None else spd.positive_or_nan(spd.symmetrise(given))
 
     @property
     def _edges(self) -> Float[Array, "n 3 d"]:
@@ -216,7 +231,7 @@ def _checked_metric(metric: Any, triangulation: Triangulation) -> Float[Array, "
         raise ValueError(f"metric: got shape {array.shape}; expected {expected}")
     if not is_traced(array):
         require_spd("metric", np.asarray(array), np.ones(n, dtype=bool), words.one)
-    return spd.symmetrise(array)
+    return array
 
 
 @numpy_where_known(static_argnums=(3, 4))

@@ -213,7 +213,8 @@ def eigh(tensors: Float[Array, "... d d"]) -> tuple[Float[Array, "... d"], Float
 
 
 def _log_of_pairs(values: Float[Array, "... d"], vectors: Float[Array, "... d d"]) -> Float[Array, "... d d"]:
-    return _compose(vectors, jnp.log(values)[..., None] * jnp.eye(values.shape[-1], dtype=values.dtype))
+    identity = jnp.broadcast_to(jnp.eye(values.shape[-1], dtype=values.dtype), vectors.shape)
+    return _compose(vectors, jnp.log(values)[..., None] * identity)
 
 
 def _compose(vectors: Float[Array, "... d d"], inner: Float[Array, "... d d"]) -> Float[Array, "... d d"]:

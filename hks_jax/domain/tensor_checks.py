@@ -13,19 +13,39 @@ from hks_jax.domain.grid import Grid
 from hks_jax.traced import is_traced
 
 MetricChoice = Literal["tensor", "inverse", "adjugate"]
+OperatorChoice = Literal["laplace-beltrami", "fick"]
 Interpolation = Literal["linear", "log-euclidean"]
 
 MANY = 0.05
 """The largest fraction of the tensors that noise at the rim of a mask plausibly makes invalid."""
 
 
-def check_metric_choice(metric: str | None) -> None:
-    """Raise ValueError unless ``metric`` names one of the metrics that diffusion tensors can define."""
+def of_diffusion(metric: str | None, operator: str) -> MetricChoice:
+    """Return the metric that is made of diffusion tensors D for an operator; Fick's operator has the metric D⁻¹.
+
+    Raises:
+        ValueError: an unknown name; no metric for the Laplace–Beltrami operator; a metric for Fick's operator.
+    """
+    if checked_operator(operator) == "fick":
+        if metric is not None:
+            raise ValueError(
+                f'metric: got {metric!r} with operator="fick", which determines the metric D⁻¹. Leave one of them out'
+            )
+        return "inverse"
     if metric not in ("tensor", "inverse", "adjugate"):
         raise ValueError(
-            f'metric: got {metric!r}; expected "inverse" (g = D⁻¹, the distances of diffusion), '
-            '"tensor" (g = D, as in the paper) or "adjugate" (g = |D| D⁻¹). There is no default: choose one'
+            f'metric: got {metric!r}; expected "inverse" (g = D⁻¹, in which points are near if diffusion is fast), '
+            '"tensor" (g = D, as in the paper) or "adjugate" (g = |D| D⁻¹), or no metric with operator="fick" (Fick\'s '
+            "law). There is no default: choose one"
         )
+    return metric  # type: ignore[return-value]
+
+
+def checked_operator(operator: Any) -> OperatorChoice:
+    """Return the name of an operator; raise ValueError for an unknown name."""
+    if operator not in ("laplace-beltrami", "fick"):
+        raise ValueError(f'operator: got {operator!r}; expected "laplace-beltrami" or "fick"')
+    return operator
 
 
 def checked_interpolation(interpolation: Any) -> Interpolation:
@@ -59,7 +79,9 @@ def require_spd(
     Messages call the location of a tensor by the word `place`: ``"node"`` on grids, ``"vertex"`` or others on meshes.
     """
     require_finite_symmetric(name, tensors, inside, place)
-    bad = inside & ~spd.is_spd(tensors)
+    size = np.abs(tensors).max(axis=(-2, -1))
+    scaled = tensors / np.where(size > 0, size, 1)[..., None, None]
+    bad = inside & ~spd.is_spd(scaled)
     if bad.any():
         what = f"not positive definite, worst eigenvalue {least_eigenvalue(tensors[bad]):.3g}"
         of_grids = f"{_MASK}, or raise their eigenvalues (hks_jax.io.repair_tensors)"
@@ -69,6 +91,14 @@ def require_spd(
                 f"metric by hks_jax.TensorField.from_indefinite. {_MASK}, if they are outside the domain"
             )
         refuse(name, bad, inside, place, what, of_grids if place == "node" else "Raise their eigenvalues")
+    # The determinant is computed in the dtype of the tensors, where it may underflow to 0 or overflow.
+    d, limits = tensors.shape[-1], np.finfo(tensors.dtype if tensors.dtype.kind == "f" else np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):  # outside the mask
+        digits = np.log10(spd.determinant(scaled.astype(np.float64))) + d * np.log10(size.astype(np.float64))
+    bad = inside & ~((digits > np.log10(limits.tiny)) & (digits < np.log10(limits.max)))
+    if bad.any():
+        what = f"so small or large that their determinant, about 1e{digits[bad][0]:.0f}, is not a {limits.dtype} number"
+        refuse(name, bad, inside, place, what, "Use another unit, in which the eigenvalues are near 1")
 
 
 def require_finite_symmetric(
@@ -184,7 +214,7 @@ def positive_map(
             )
     symmetric = spd.symmetrise(spd.identity_outside(tensors, inside))
     number = jnp.asarray(number, tensors.dtype)
-    eye = jnp.eye(tensors.shape[-1], dtype=tensors.dtype)
+    eye = jnp.broadcast_to(jnp.eye(tensors.shape[-1], dtype=tensors.dtype), tensors.shape)
     mapped = spd.exp(symmetric / number) if how == "exp" else symmetric + number * eye
     if known and not spd.is_spd(np.asarray(mapped)[inside]).all():
         raise ValueError(

@@ -17,9 +17,11 @@ from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_checks import (
     Interpolation,
     MetricChoice,
+    OperatorChoice,
     PositiveMap,
-    check_metric_choice,
     checked_interpolation,
+    checked_operator,
+    of_diffusion,
     positive_map,
     require_grid,
     require_spd,
@@ -30,7 +32,7 @@ from hks_jax.traced import is_traced
 
 
 class TensorField(eqx.Module):
-    """A Riemannian metric given at the nodes of a grid.
+    """A Riemannian metric given at the nodes of a grid, and the operator that it defines.
 
     A field is a pytree: its leaves are the tensors, or the arrays in the metric's function. The grid is static. Under
     `jit`, `grad` or `vmap` only shapes are checked, not values, and a tensor that is not positive definite gives NaN.
@@ -43,10 +45,13 @@ class TensorField(eqx.Module):
             Zobel, Reininghaus and Hotz; if the eigenvectors turn, the determinant is larger between the nodes. With
             ``"log-euclidean"`` the components of log T are multilinear (Arsigny, Fillard, Pennec and Ayache), as is the
             logarithm of the determinant, and T⁻¹ is interpolated in the same way as T.
+        operator: ``"laplace-beltrami"``, the operator |T|^(−½) div(|T|^½ T⁻¹∇u) of the metric T; or ``"fick"``, the
+            operator div(D∇u) of Fick's law with D = T⁻¹, whose volume element is dx, and whose linear interpolation is
+            that of D (see `from_diffusion`). Distances are those of the metric T for both operators.
 
     Raises:
         ValueError: a wrong shape; tensors that are NaN, infinite, unsymmetric or not positive definite inside the mask
-            (with their number, the first node and the worst eigenvalue); an unknown interpolation.
+            (with their number, the first node and the worst eigenvalue); an unknown interpolation or operator.
 
     Examples:
         >>> rectangle = hj.TensorField(field.grid, np.tile(np.diag([4.0, 1.0]), (9, 9, 1, 1)))
@@ -56,18 +61,32 @@ class TensorField(eqx.Module):
 
     grid: Grid = eqx.field(static=True)
     interpolation: Interpolation = eqx.field(static=True)
+    operator: OperatorChoice = eqx.field(static=True)
     function: jtu.Partial | None
     _tensors: Float[Array, "*shape d d"] | None
 
-    def __init__(self, grid: Grid, tensors: Any, interpolation: Interpolation = "linear") -> None:
+    def __init__(
+        self,
+        grid: Grid,
+        tensors: Any,
+        interpolation: Interpolation = "linear",
+        *,
+        operator: OperatorChoice = "laplace-beltrami",
+    ) -> None:
         self.grid = grid
         self.interpolation = checked_interpolation(interpolation)
+        self.operator = checked_operator(operator)
         self.function = None
-        self._tensors = spd.symmetrise(_checked_tensors("tensors", grid, tensors))
+        self._tensors = _checked_tensors("tensors", grid, tensors)
 
     @classmethod
     def from_function(
-        cls, fn: Callable[[Array], Any], grid: Grid, interpolation: Interpolation = "linear"
+        cls,
+        fn: Callable[[Array], Any],
+        grid: Grid,
+        interpolation: Interpolation = "linear",
+        *,
+        operator: OperatorChoice = "laplace-beltrami",
     ) -> "TensorField":
         """Return the metric ``fn``, which maps coordinates (d,) to a tensor (d, d) and is differentiable by JAX.
 
@@ -87,15 +106,21 @@ class TensorField(eqx.Module):
             )
         function: Any = fn if isinstance(fn, jtu.Partial | eqx.Module) else jtu.Partial(fn)
         _checked_tensors("fn", grid, _evaluate(function, grid))
-        return cls._checked(grid, interpolation, function=function)
+        return cls._checked(grid, interpolation, function=function, operator=operator)
 
     @classmethod
     def _checked(
-        cls, grid: Grid, interpolation: Interpolation, tensors: Any = None, function: Any = None
+        cls,
+        grid: Grid,
+        interpolation: Interpolation,
+        tensors: Any = None,
+        function: Any = None,
+        operator: OperatorChoice = "laplace-beltrami",
     ) -> "TensorField":
         """Return a field without another check of its tensors or of its function's values."""
-        field, interpolation = cls.__new__(cls), checked_interpolation(interpolation)
-        values = {"grid": grid, "interpolation": interpolation, "function": function, "_tensors": tensors}
+        field, settings = cls.__new__(cls), {"interpolation": checked_interpolation(interpolation)}
+        values = {**settings, "grid": grid, "operator": checked_operator(operator), "function": function}
+        values["_tensors"] = tensors
         for name, value in values.items():
             object.__setattr__(field, name, value)
         return field
@@ -107,30 +132,45 @@ class TensorField(eqx.Module):
         D: Any,
         metric: MetricChoice | None = None,
         *,
+        operator: OperatorChoice = "laplace-beltrami",
         interpolation: Interpolation = "linear",
         name: str = "D",
     ) -> "TensorField":
-        """Return the metric of a field of diffusion tensors D (*shape, d, d).
+        """Return the metric of a field of diffusion tensors D (*shape, d, d), or the field of Fick's operator.
 
-        There is no default for ``metric``, because several conventions are in use:
+        Pass either ``metric`` or ``operator="fick"``; there is no default, because several conventions are in use. The
+        metric g gives its Laplace–Beltrami operator, which does not depend on coordinates:
 
-        - ``"inverse"``: g = D⁻¹, whose distances are the distances of diffusion with diffusivity D; the times of
-          signatures have units of time;
+        - ``"inverse"``: g = D⁻¹, in which two points are near if diffusion between them is fast. The operator is
+          √|D| div(|D|^(−½) D∇u) = div(D∇u) − ½ (D∇log|D|)·∇u, which is Fick's only where |D| is constant. Heat becomes
+          uniform with respect to the volume |D|^(−½) dx. The times of signatures have units of time.
         - ``"tensor"``: g = D, as in Zobel, Reininghaus and Hotz;
-        - ``"adjugate"``: g = |D| D⁻¹, the inverse scaled so that |g| = |D|^(d−1).
+        - ``"adjugate"``: g = |D| D⁻¹, the inverse scaled so that |g| = |D|^(d−1). In three dimensions the operator is
+          |D|⁻¹ div(D∇u), which has the steady states of Fick's operator.
 
-        The field interpolates g between the nodes. With ``"log-euclidean"``, interpolating D would give the same g.
+        ``operator="fick"`` gives Fick's operator div(D∇u), the diffusion of a substance with the diffusivity D, whose
+        density becomes uniform with respect to the volume dx. Its metric is D⁻¹: for small times, heat spreads by the
+        distances of D⁻¹. Times have units of time.
+
+        The field interpolates g, or D for Fick's operator, between the nodes. With ``"log-euclidean"`` both are the
+        same.
 
         Examples:
             >>> metric = hj.TensorField.from_diffusion(field.grid, field.tensors, metric="inverse")
             >>> print(jnp.linalg.det(metric.tensors[4, 4]).round(3))  # 1/|D|
             0.25
+            >>> diffusion = hj.TensorField.from_diffusion(field.grid, field.tensors, operator="fick")
+            >>> pencil = hj.assemble(diffusion)
+            >>> print(pencil.measure.round(3), pencil.volume.round(3))  # the integrals of dx and of |D|^(−½) dx
+            1.0 0.5
         """
-        tensors = spd.symmetrise(_checked_tensors(name, grid, D))
-        check_metric_choice(metric)
+        tensors = _checked_tensors(name, grid, D)
+        metric = of_diffusion(metric, operator)
         if metric == "tensor":
             return cls._checked(grid, interpolation, tensors)
-        return cls(grid, _metric_of_diffusion(spd.identity_outside(tensors, grid.inside), metric), interpolation)
+        tensors = spd.symmetrise(tensors)
+        given = _metric_of_diffusion(spd.identity_outside(tensors, grid.inside), metric)
+        return cls(grid, given, interpolation, operator=operator)
 
     @classmethod
     def from_deformation(
@@ -161,7 +201,7 @@ class TensorField(eqx.Module):
             [[1.0, 1.0], [1.0, 2.0]]
         """
         C = _checked_tensors(f"{name}ᵀ{name}", grid, right_cauchy_green(name, grid, F))
-        return cls._checked(grid, interpolation, spd.symmetrise(C))
+        return cls._checked(grid, interpolation, C)
 
     @classmethod
     def from_indefinite(
@@ -205,19 +245,28 @@ class TensorField(eqx.Module):
             [3. 1.]
         """
         mapped = positive_map(name, tensors_on(grid, name, S), how, number, grid.inside)
-        return cls._checked(grid, interpolation, spd.symmetrise(mapped))
+        return cls._checked(grid, interpolation, mapped)
 
     def __repr__(self) -> str:
         values = "a function" if self.function is not None else describe_array(self._tensors)
-        return f"TensorField({values} on {self.grid!r}, interpolation={self.interpolation!r})"
+        operator = "" if self.operator == "laplace-beltrami" else f", operator={self.operator!r}"
+        return f"TensorField({values} on {self.grid!r}, interpolation={self.interpolation!r}{operator})"
+
+    def with_tensors(self, tensors: Any, grid: Grid | None = None) -> "TensorField":
+        """Return the field of other metric tensors, on another grid if one is given, with the same settings.
+
+        Examples:
+            >>> print(field.with_tensors(2 * field.tensors).tensors[4, 4].diagonal())
+            [8. 2.]
+        """
+        return TensorField(grid or self.grid, tensors, self.interpolation, operator=self.operator)
 
     @property
     def tensors(self) -> Float[Array, "*shape d d"]:
-        """The tensors at the nodes, symmetric."""
-        if self.function is None:
-            assert self._tensors is not None
-            return self._tensors
-        return spd.symmetrise(_evaluate(self.function, self.grid))
+        """The tensors at the nodes: the symmetric parts of the leaf or of the function's values."""
+        # The symmetric part is taken here, and not when the field is made, because the leaf may change afterwards. So
+        # gradients with respect to the leaf are symmetric, and a leaf that an optimiser makes unsymmetric is harmless.
+        return spd.symmetrise(self._tensors if self.function is None else _evaluate(self.function, self.grid))
 
     @property
     def domain_tensors(self) -> Float[Array, "*shape d d"]:
@@ -229,6 +278,25 @@ class TensorField(eqx.Module):
 def _metric_of_diffusion(xp: Any, D: Any, metric: MetricChoice) -> Any:
     # In three dimensions −D and D have the same adjugate, so D is set to NaN where it is not positive definite.
     return spd.metric_of_diffusion(spd.nan_unless_positive(xp, D), metric)
+
+
+def diffusion_tensors(field: TensorField) -> Float[Array, "*shape d d"]:
+    """Return the tensors D = T⁻¹ of Fick's operator at the nodes: the identity outside the mask, NaN for a bad T."""
+    return _inverse(field.domain_tensors)
+
+
+@numpy_where_known()
+def _inverse(xp: Any, tensors: Any) -> Any:
+    return spd.inverse(tensors)
+
+
+def require_laplace_beltrami(field: TensorField, what: str) -> None:
+    """Raise ValueError if the field's operator is not that of its metric."""
+    if field.operator != "laplace-beltrami":
+        raise ValueError(
+            f"field: got operator={field.operator!r}, but {what} belongs to the Laplace–Beltrami operator; expected a "
+            'metric, such as from_diffusion(grid, D, metric="inverse")'
+        )
 
 
 def require_field(field: Any) -> None:

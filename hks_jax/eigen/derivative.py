@@ -1,5 +1,6 @@
 """Derivatives of eigenpairs with respect to stiffness and mass."""
 
+from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
 
@@ -81,9 +82,9 @@ def _solved_jvp(
     adjoint = InteriorAdjoint(solver.adjoint.tolerance) if interior else solver.adjoint
     # Data from `prepare` do not depend on the pencil's tangent, so all products with one Jacobian share these data.
     prepared = one_by_one(_prepare, (adjoint, k), pencil, values) if _solves(pencil, k, len(values)) else None
-    if isinstance(pencil, Pencil) and pencil.metric is not None:
-        # The metric is removed: derivatives do not need it, and reverse mode would store its arrays.
-        pencil = eqx.tree_at(lambda p: p.metric, pencil, None)
+    if isinstance(pencil, Pencil):
+        # Metric and density are removed: derivatives do not need them, and reverse mode would store their arrays.
+        pencil = replace(pencil, metric=None, density=None)
     on_failure: OnFailure = "error" if throw else "nothing" if is_traced(primals) else "warning"
     eigenvalues, functions, following = _cut(values, vectors, k)
     tangents = tangents_of(adjoint, on_failure, prepared, pencil, change, values, vectors, functions)

@@ -96,6 +96,7 @@ def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: i
         together(frames),
         jnp.concatenate([pairs.residuals for pairs in solved])[lowest],
         jnp.concatenate([pairs.converged for pairs in solved])[lowest],
+        jnp.concatenate([pairs.rounding for pairs in solved])[lowest],
         kept=jnp.ones(k, bool),
         part=jax_array(np.repeat(np.arange(len(solved)), sizes))[lowest],
         next_eigenvalue=jax.lax.stop_gradient(values[order[k]]) if extra else jnp.asarray(jnp.inf, values.dtype),

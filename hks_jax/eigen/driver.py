@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from hks_jax.accuracy import warn_of_accuracy
+from hks_jax.checks import require_static
 from hks_jax.eigen.automatic import choose_solver, choose_solvers
 from hks_jax.eigen.derivative import of_simple
 from hks_jax.eigen.doubled import merge, solve_doubled
@@ -79,7 +80,7 @@ def eigenpairs(
 
     Warns:
         AccuracyWarning: values are concrete, and some pairs did not converge, the solver could not confirm that it
-            missed no eigenvalue, or k cuts a multiple eigenvalue.
+            missed no eigenvalue, k cuts a multiple eigenvalue, or float32 does not distinguish an eigenvalue from zero.
 
     Examples:
         >>> flat = hj.TensorField(field.grid, np.tile(np.eye(2), (9, 9, 1, 1)))
@@ -94,21 +95,25 @@ def eigenpairs(
         pairs = _in_interval(pencil, interval, k, solver, throw, report)
     else:
         total = sum(part.size for part in pencil.parts)
-        if not isinstance(k, int | float | np.number) or k != k // 1 or not 1 <= k <= total:
+        require_static("k", k)
+        number = np.asarray(k)
+        if number.ndim or number.dtype.kind not in "iuf" or number != number // 1 or not 1 <= number <= total:
             raise ValueError(
                 f"k: got {k}; expected an integer from 1 to {total}, the number of degrees of freedom. "
                 "Use a smaller k or a finer grid"
             )
-        pairs = _lowest(pencil, int(k), solver, multiplet, throw, report)
+        pairs = _lowest(pencil, int(number), solver, multiplet, throw, report)
     gauge = pairs.eigenvalues, pairs.next_eigenvalue, pairs.kept, pairs.part, pairs.pencil
     pairs = eqx.tree_at(lambda p: p.vectors, pairs, of_simple(pairs.vectors, *gauge)).on(pencil)
-    if throw:
-        result = jax.lax.stop_gradient(pairs).result
-        pairs = result.error_if(pairs, result != RESULTS.successful)
     known = jax.lax.stop_gradient(pairs)
-    if not is_traced(known.eigenvalues):
-        for message in known.messages():
-            warn_of_accuracy(message)
+    result = known.result
+    if is_traced(known.eigenvalues):
+        return result.error_if(pairs, result != RESULTS.successful) if throw else pairs
+    if throw and result != RESULTS.successful:
+        codes: Any = RESULTS  # mypy sees its members as strings
+        raise RuntimeError(codes[result])
+    for message in known.messages():
+        warn_of_accuracy(message)
     return pairs
 
 

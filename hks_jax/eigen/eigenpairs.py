@@ -1,6 +1,6 @@
 """Eigenpairs, the indicators of their quality, and the truncation of a spectrum."""
 
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from hks_jax.arrays import describe_array
 from hks_jax.compilation import numpy_where_known
 from hks_jax.domain.tensor_checks import MANY
+from hks_jax.eigen.quality import indistinct
 from hks_jax.fem.pencil import AnyPencil
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.traced import is_traced
@@ -24,7 +25,7 @@ _SAMPLE = 20_000
 class RESULTS(eqx.Enumeration):
     """The outcome of a computation of eigenpairs: a traceable code like those of lineax and optimistix."""
 
-    successful = ""
+    successful = "All eigenpairs converged, and the solver confirmed that it missed none."
     not_finite = "The matrices are not finite: tensors are NaN, infinite or not positive definite."
     unconverged = (
         "Some eigenpairs did not converge (see `.converged`), or were not found and are NaN. Use float64, fewer pairs, "
@@ -33,6 +34,10 @@ class RESULTS(eqx.Enumeration):
     unconfirmed = (
         "The solver could not confirm that it missed no eigenvalue above `.complete_below`. Use another solver, or a "
         "slightly different k."
+    )
+    uncertain = (
+        "Some eigenvalues cannot be distinguished from zero in float32 (see `.rounding`). Use float64, or state the "
+        "null vectors."
     )
 
 
@@ -54,6 +59,9 @@ class Eigenpairs(eqx.Module):
             the null space is unknown, max(λ, λ₁) is replaced by the larger of two numbers: the mean gap of the
             eigenvalues, and the distance of λ from `spectral_origin`.
         converged: (k,) whether the residual is at most the solver's tolerance, or at most the level of rounding.
+        rounding: (k,) for eigenvalues of float32 matrices that are zero within the rounding of the largest eigenvalue,
+            the error that rounding of the matrices' entries may cause; 0 for other eigenvalues, and for eigenvalues
+            that are zero in float64 too. Derivatives treat `rounding` as a constant.
         kept: (k,) whether each pair belongs to the truncated spectrum; signatures ignore the other pairs. The choices
             ``multiplet="drop"`` and ``"complete"`` may exclude the last pairs; `of_part` keeps only one part's pairs.
         part: (k,) for the boundaries "mirror" and "mean", the index of the pencil's part that each pair belongs to (0
@@ -66,7 +74,7 @@ class Eigenpairs(eqx.Module):
         spectral_origin: the reference point of relative errors: 0 if K ⪰ 0 is known, otherwise the lowest eigenvalue;
             for an interval its lower end.
         multiplet_tolerance: the gap, relative to the distance from `spectral_origin`, below which neighbouring
-            eigenvalues count as equal.
+            eigenvalues count as equal. If the null space is unknown, gaps at the level of rounding count as zero too.
         pencil: the matrices K and M.
         solver_name: the name of the solver.
         lowest: whether the pairs are the lowest; false for an interval.
@@ -77,6 +85,7 @@ class Eigenpairs(eqx.Module):
     frame: Float[Array, "k n_dof"]
     residuals: Float[Array, " k"]
     converged: Bool[Array, " k"]
+    rounding: Float[Array, " k"]
     kept: Bool[Array, " k"]
     part: Int[Array, " k"] | None
     next_eigenvalue: Float[Array, ""]
@@ -153,8 +162,16 @@ class Eigenpairs(eqx.Module):
     @property
     def cut_multiplet(self) -> Array:
         """The number of kept pairs of the multiple eigenvalue that the cut divides; 0 if the cut divides none."""
-        known = self.eigenvalues, self.kept, self.next_eigenvalue, self.spectral_origin, self.multiplet_tolerance
-        return _cut_multiplet(*jax.lax.stop_gradient(known)) if self.k else jnp.zeros((), int)
+        return _cut_multiplet(self._spectrum, self.kept) if self.k else jnp.zeros((), int)
+
+    @property
+    def _spectrum(self) -> "_Spectrum":
+        # A known null space makes the lowest eigenvalues exact, and the distance of the others from zero is accurate.
+        parts = () if self.pencil is None else self.pencil.parts
+        unknown = [indistinct(part, self.eigenvalues.dtype) for part in parts if part.null_space is None]
+        rounding = jnp.max(jnp.stack(unknown)) if unknown else jnp.zeros((), self.eigenvalues.dtype)
+        known = self.eigenvalues, self.next_eigenvalue, self.spectral_origin, self.multiplet_tolerance, rounding
+        return _Spectrum(*jax.lax.stop_gradient(known))
 
     @property
     def unconfirmed(self) -> Bool[Array, ""]:
@@ -165,15 +182,20 @@ class Eigenpairs(eqx.Module):
         if not self.k:
             return jnp.zeros((), bool)
         optional = self.lowest and (self.pencil is None or all(part.bounded for part in self.pencil.parts))
-        known = self.eigenvalues, self.kept, self.complete_below, self.spectral_origin, self.multiplet_tolerance
-        return _unconfirmed(*known, optional)
+        return _unconfirmed(self._spectrum, self.kept, jax.lax.stop_gradient(self.complete_below), optional)
+
+    @property
+    def uncertain(self) -> Bool[Array, " k"]:
+        """Whether each eigenvalue is zero within `rounding`, and may be positive, negative or zero."""
+        return self.kept & (self.rounding > 0) & (jnp.abs(self.eigenvalues) <= self.rounding)
 
     @property
     def result(self) -> RESULTS:
         """The traceable code of the most serious failure, for a comparison with ``RESULTS.successful``."""
         finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(self.pencil) if eqx.is_inexact_array(leaf)]
         code: Any = RESULTS  # mypy sees its members as strings
-        result = code.where(self.unconfirmed, code.unconfirmed, code.successful)
+        result = code.where(jnp.any(self.uncertain), code.uncertain, code.successful)
+        result = code.where(self.unconfirmed, code.unconfirmed, result)
         result = code.where(jnp.all(self.converged), result, code.unconverged)
         return code.where(jnp.all(jnp.stack(finite)), result, code.not_finite)
 
@@ -201,10 +223,18 @@ class Eigenpairs(eqx.Module):
                 f"Use slightly more or fewer pairs, or {other}"
             )
         if cut:
-            remedy = f"Take k = {kept - cut} or a larger k" if cut < kept else "Take a larger k"
+            fewer = f"k = {kept - cut} or " if cut < kept else ""
             sentences.append(
                 f"k = {kept} cuts a multiple eigenvalue: the last {cut} pair(s), at λ = {last:.6g}, are an arbitrary "
-                f"part of its eigenspace. {remedy}"
+                f"part of its eigenspace. Take {fewer}the k that `count_eigenvalues` counts just above this λ"
+            )
+        if (uncertain := np.asarray(self.uncertain)).any():
+            some = ", ".join(f"{value:.3g}" for value in values[uncertain][:3])
+            most, of = float(np.asarray(self.rounding)[uncertain].max()), int(uncertain.sum())
+            stated = "" if self.null_space_known else ", or give `sparse_pencil` the null vectors"
+            sentences.append(
+                f"{of} of {values.size} eigenvalues (λ = {some}{', …' * (of > 3)}) cannot be distinguished from zero: "
+                f"rounding of the matrices to float32 changes them by up to {most:.1e}. Use float64{stated}"
             )
         stretch = _anisotropy(self.pencil) if values.dtype == np.float32 else 1.0
         if (rounding := np.finfo(np.float32).eps * stretch) > _ROUNDED:
@@ -260,24 +290,49 @@ def _anisotropy(pencil: AnyPencil | None) -> float:
     return float(np.quantile(values[:, -1] / values[:, 0], 1 - MANY)) if len(values) else 1.0
 
 
-def multiplet_gap(xp: Any, values: Any, origin: Any, tolerance: Any) -> Any:
-    """Return, for each eigenvalue, the largest gap to the next one at which the two count as equal, (*k)."""
-    finfo = jnp.finfo(values.dtype)
-    return tolerance * xp.maximum(xp.maximum(values - origin, finfo.eps * xp.abs(values)), finfo.tiny)
+class _Spectrum(NamedTuple):
+    """Computed eigenvalues, and the numbers that decide which of them count as equal; constants in derivatives."""
+
+    values: Any  # (k,) the eigenvalues, ascending
+    following: Any  # the next eigenvalue
+    origin: Any  # `Eigenpairs.spectral_origin`
+    tolerance: Any  # `Eigenpairs.multiplet_tolerance`
+    rounding: Any  # the rounding error of eigenvalues if no null space is known, otherwise 0
 
 
-@numpy_where_known(static_argnums=5)
-def _unconfirmed(xp: Any, values: Any, kept: Any, bound: Any, origin: Any, tolerance: Any, optional: bool) -> Any:
-    last = values[xp.sum(kept) - 1]
-    needed = last - 2 * tolerance * (last - origin)
+# If no null space is known, the origin is the lowest computed eigenvalue, so distances from it do not show the rounding
+# errors of its copies. Copies differ by the rounding error of the matrix. In single precision on fine grids, this worst
+# case exceeds the gaps of distinct eigenvalues, whose errors are smaller. So rounding counts only up to a thousandth of
+# the spectrum's length, unless all eigenvalues are equal within rounding.
+def _gaps(xp: Any, spectrum: _Spectrum) -> Any:
+    """Return, for each eigenvalue, the largest gap to the next one at which the two count as equal, (k)."""
+    values, _, origin, tolerance, rounding = spectrum
+    finfo, length = jnp.finfo(values.dtype), xp.nanmax(values) - origin
+    rounding = xp.where(length <= rounding, rounding, xp.minimum(rounding, length / 1000))
+    stored = 4 * finfo.eps * xp.abs(values)
+    return xp.maximum(xp.maximum(tolerance * (values - origin), stored), xp.maximum(rounding, finfo.tiny))
+
+
+@numpy_where_known(static_argnums=3)
+def _unconfirmed(xp: Any, spectrum: _Spectrum, kept: Any, bound: Any, optional: bool) -> Any:
+    last = xp.sum(kept) - 1
+    # The solver may have shifted the matrix, which increases rounding, and counts outside of the copies' errors.
+    needed = spectrum.values[last] - 2 * _gaps(xp, spectrum._replace(rounding=16 * spectrum.rounding))[last]
     return bound < needed if optional else ~(bound >= needed)
 
 
 @numpy_where_known()
-def _cut_multiplet(xp: Any, values: Any, kept: Any, following: Any, origin: Any, tolerance: Any) -> Any:
-    last = values[xp.sum(kept) - 1]
-    gap = multiplet_gap(xp, last, origin, tolerance)
-    return xp.where(following - last <= gap, xp.sum(kept & (values >= last - gap)), 0)
+def _cut_multiplet(xp: Any, spectrum: _Spectrum, kept: Any) -> Any:
+    count = xp.sum(kept)
+    ends, index = _ends_of_multiplets(xp, spectrum), xp.arange(len(kept))
+    beyond = xp.append(spectrum.values, spectrum.following)[count]
+    whole = ends[count - 1] | xp.isnan(beyond - spectrum.values[count - 1])  # pairs that were not found are NaN
+    return xp.where(whole, 0, count - xp.max(xp.where(ends & (index < count), index + 1, 0)))
+
+
+def _ends_of_multiplets(xp: Any, spectrum: _Spectrum) -> Any:
+    """Return the mask (k) of eigenvalues that differ from the next one."""
+    return xp.diff(xp.append(spectrum.values, spectrum.following)) > _gaps(xp, spectrum)
 
 
 MultipletChoice = Literal["report", "drop", "complete"]
@@ -292,25 +347,20 @@ def truncate(pairs: Eigenpairs, k: int, multiplet: MultipletChoice) -> Eigenpair
     ``"report"`` keeps exactly k. If k cuts a multiple eigenvalue, ``"drop"`` excludes its pairs, unless no pair would
     remain; ``"complete"`` includes all its pairs if they were computed, and otherwise excludes them.
     """
-    known = pairs.eigenvalues, pairs.next_eigenvalue, pairs.spectral_origin, pairs.multiplet_tolerance
-    chosen = _choose(*jax.lax.stop_gradient(known), k, multiplet)
+    chosen = _choose(pairs._spectrum, k, multiplet)
     return eqx.tree_at(lambda p: (p.kept, p.next_eigenvalue), pairs, chosen)
 
 
-@numpy_where_known(static_argnums=(4, 5))
-def _choose(
-    xp: Any, values: Any, following: Any, origin: Any, tolerance: Any, k: int, multiplet: MultipletChoice
-) -> tuple[Any, Any]:
-    size = len(values)
-    sequence = xp.append(values, following)
+@numpy_where_known(static_argnums=(1, 2))
+def _choose(xp: Any, spectrum: _Spectrum, k: int, multiplet: MultipletChoice) -> tuple[Any, Any]:
+    size, ends = len(spectrum.values), _ends_of_multiplets(xp, spectrum)
     index = xp.arange(size)
-    complete_up_to = xp.diff(sequence) > multiplet_gap(xp, values, origin, tolerance)
     if multiplet == "report":
         count = xp.asarray(k)
     else:
-        count = xp.max(xp.where(complete_up_to & (index < k), index + 1, 0))
+        count = xp.max(xp.where(ends & (index < k), index + 1, 0))
         if multiplet == "complete":
-            more = xp.min(xp.where(complete_up_to & (index >= k - 1), index + 1, size + 1))
+            more = xp.min(xp.where(ends & (index >= k - 1), index + 1, size + 1))
             count = xp.where(more <= size, more, count)
         count = xp.where(count > 0, count, k)
-    return index < count, sequence[count]
+    return index < count, xp.append(spectrum.values, spectrum.following)[count]

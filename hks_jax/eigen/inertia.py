@@ -28,8 +28,12 @@ from hks_jax.traced import is_traced
 
 _BESIDE = (1e-6, 1e-5, 1e-4, 1e-3)
 """Relative distances from a shift at which eigenvalues are counted if the factorisation at the shift is inaccurate."""
-_TRIES = 60
+_CLEAR = 1e-2
+"""The largest error of a solve, times √n, at which a shift is certainly no eigenvalue within rounding."""
+_TRIES = 40
 """The maximal number of factorisations in a search."""
+_UNCERTAIN = 5
+"""The number of consecutive uncertain counts after which a bracket is not divided further."""
 _JUST_BELOW = 0.625
 """The exponent p of the first shift −ε^p λ of a search, where λ is an estimate of the largest eigenvalue."""
 _ALIKE = 1e-3
@@ -96,18 +100,19 @@ def checked_pencil(domain: Any, boundary: BoundarySpec, mass: MassKind, quadratu
 def count_below(pencil: AnyPencil, below: Scalar | float) -> Number:
     """Count the eigenvalues of a pencil below a number; see `count_eigenvalues`."""
     shift = jnp.asarray(below, pencil.parts[0].stiffness.dtype)
-    count, sound = _total(pencil, shift)
+    count, sound, clear = _total(pencil, shift)
     if is_traced((count, sound)):
         return jnp.where(sound, count, -1)
-    if sound:
+    if sound and clear:
         return count
     # Distances are relative to |σ| or, if σ is near zero, to the expected size of the lowest positive eigenvalue.
     volume, dimension = pencil.volume, pencil.space.dimension
     least = 1e-6 * largest(pencil.parts[0]) if volume is None or dimension is None else volume ** (-2 / dimension)
     size = max(abs(float(shift)), float(least))
-    for relative in _BESIDE:
+    for relative in _BESIDE[:1] if sound else _BESIDE:
         low, high = float(shift) - relative * size, float(shift) + relative * size
-        (under, sound_under), (over, sound_over) = (_total(pencil, jnp.asarray(s, shift.dtype)) for s in (low, high))
+        counts = (_total(pencil, jnp.asarray(s, shift.dtype)) for s in (low, high))
+        (under, sound_under, _), (over, sound_over, _) = counts
         if sound_under and sound_over:
             if under == over:
                 return under
@@ -115,27 +120,34 @@ def count_below(pencil: AnyPencil, below: Scalar | float) -> Number:
                 f"below: got {float(shift):.15g}, which is too close to an eigenvalue; {int(under)} eigenvalues are "
                 f"below {low:.12g} and {int(over)} are below {high:.12g}. Use one of these two bounds"
             )
+    if sound:
+        return count
     raise ValueError(
         f"below: got {float(shift):.15g}, at which rounding in {shift.dtype} leaves the count uncertain. "
         "Use another number, or float64"
     )
 
 
-def _total(pencil: AnyPencil, shift: Scalar) -> Count:
-    counts = [certain_count(part, shift) for part in pencil.parts]
-    return sum((count for count, _ in counts), jnp.zeros((), int)), jnp.all(jnp.stack([sound for _, sound in counts]))
+def _total(pencil: AnyPencil, shift: Scalar) -> tuple[Number, Flag, Flag]:
+    """Return the number of eigenvalues below a shift, whether it is certain, and whether the shift is none of them."""
+    counts, sound, rates = zip(*(_counted(part, dissect(part.pattern), shift) for part in pencil.parts), strict=True)
+    # At an eigenvalue within rounding, the sign of a pivot is right for the shift, but not for the computed eigenvalue.
+    # The same solves that test the inertia then have residuals of the order of their right-hand sides.
+    clear = [rate < _CLEAR / math.sqrt(part.size) for rate, part in zip(rates, pencil.parts, strict=True)]
+    return sum(counts, jnp.zeros((), int)), jnp.all(jnp.stack(sound)), jnp.all(jnp.stack(clear))
 
 
 def certain_count(pencil: SymmetricPencil, shift: Scalar) -> Count:
     """Return the number of eigenvalues of one pencil below a shift, and whether this number is certain."""
-    return _certain_count(pencil, dissect(pencil.pattern), shift)
+    return _counted(pencil, dissect(pencil.pattern), shift)[:2]
 
 
 # The nested dissection is an argument, because compilation with so large a constant (74 MB at 1024² nodes) is slow.
 @jit_quickly()
-def _certain_count(pencil: SymmetricPencil, dissection: Dissection, shift: Scalar) -> Count:
+def _counted(pencil: SymmetricPencil, dissection: Dissection, shift: Scalar) -> tuple[Number, Flag, Scalar]:
+    """Return the result of `certain_count`, and the rate of `Trial`."""
     factor, trial, _ = certain_factorisation(dissection, pencil, shift)
-    return factor.negative, trial.sound
+    return factor.negative, trial.sound, trial.rate
 
 
 class LocatedPencil(SymmetricPencil):
@@ -150,8 +162,8 @@ def translated(
     pencil: SymmetricPencil, origin: Scalar, negative: Number, first: Scalar, spacing: Scalar
 ) -> LocatedPencil:
     """Return the pencil of K − σ₀M and M, where σ₀ is the origin, with counts of its spectrum near σ₀."""
-    moved = pencil.stiffness.with_flat(pencil.shifted(jax.lax.stop_gradient(origin)))
-    return LocatedPencil(moved, pencil.mass, *jax.lax.stop_gradient((negative, first, spacing)))
+    moved, source = pencil.moved_by(jax.lax.stop_gradient(origin))
+    return LocatedPencil(moved, pencil.mass, *jax.lax.stop_gradient((negative, first, spacing)), source=source)
 
 
 class _Descent(NamedTuple):
@@ -203,6 +215,7 @@ class _Search(NamedTuple):
     number: Number  # the number of eigenvalues below `high`
     first: Scalar  # the highest shift with `number` eigenvalues below it; solves there are most accurate
     next: Scalar  # the shift below which eigenvalues are counted next
+    uncertain: Number  # the number of consecutive uncertain counts
     tries: Number  # the number of factorisations so far
     going: Flag  # whether the search goes on
 
@@ -211,8 +224,8 @@ def locate(pencil: SymmetricPencil, wanted: int, probes: int) -> tuple[Scalar, S
     """Return an origin below all eigenvalues, a shift above the lowest 1 to 2·wanted eigenvalues, and their number.
 
     A bracket is halved, or divided in proportion to the counts, until it contains few enough eigenvalues. Each
-    factorisation is tested with `probes` random right-hand sides. If many eigenvalues are equal within rounding, the
-    number exceeds 2·wanted. If the search fails, the origin and the shift are NaN.
+    factorisation is tested with `probes` random right-hand sides. If rounding does not separate many eigenvalues, the
+    number exceeds 2·wanted. If the search fails within `_TRIES` factorisations, the origin and the shift are NaN.
     """
     size, count = scale(pencil), _counting(pencil, probes)
     infinite = jnp.full((), jnp.inf, size.dtype)
@@ -224,10 +237,9 @@ def locate(pencil: SymmetricPencil, wanted: int, probes: int) -> tuple[Scalar, S
         return _narrowed(state, *count(state.next), size, least, wanted, pencil.size)
 
     # Outside `jit`, the search for the origin calls the same compiled factorisation as spectrum slicing, which follows.
-    start = _Search(-infinite, infinite, none, infinite, -least, none, jnp.ones((), bool))
-    state = while_loop(lambda state: state.going, step, start)
-    known = jnp.isfinite(state.low) & jnp.isfinite(state.high)
-    low, first = (jnp.where(known, end, jnp.nan) for end in (state.low, state.first))
+    start = _Search(-infinite, infinite, none, infinite, -least, none, none, jnp.ones((), bool))
+    state = while_loop(lambda state: state.going & (state.tries < _TRIES), step, start)
+    low, first = (jnp.where(state.going, jnp.nan, end) for end in (state.low, state.first))
     return low, first, state.number
 
 
@@ -243,11 +255,15 @@ def _narrowed(state: _Search, count: Number, sound: Flag, size: Scalar, least: S
     down, up = jnp.minimum(-size, 4 * state.next), 4 * jnp.maximum(low, 0) + size * wanted / n
     bracketed = jnp.isfinite(low) & jnp.isfinite(high)
     following = jnp.where(bracketed, low + share * (high - low), jnp.where(jnp.isfinite(high), down, up))
-    # If the number of eigenvalues below a shift is uncertain, the next shift is slightly larger.
+    # If the number of eigenvalues below a shift is uncertain, the next shift is slightly larger. But if even the lower
+    # end is unknown, the shift moves away from zero by a factor: size may be many orders larger than the lowest
+    # eigenvalues, as for a nearly incompressible body.
     beside = state.next + 1e-3 * jnp.where(bracketed, high - low, size * wanted / n)
-    few, tries = (number <= 2 * wanted) | (high - low <= _NARROW * least), state.tries + 1
-    going = ~(bracketed & few) & (tries < _TRIES)
-    return _Search(low, high, number, first, jnp.where(sound, following, beside), tries, going)
+    beside = jnp.where(jnp.isfinite(low), beside, 4 * state.next)
+    uncertain = jnp.where(sound, 0, state.uncertain + 1)
+    few = (number <= 2 * wanted) | (high - low <= _NARROW * least) | (uncertain >= _UNCERTAIN)
+    following = jnp.where(sound, following, beside)
+    return _Search(low, high, number, first, following, uncertain, state.tries + 1, ~(bracketed & few))
 
 
 def _counting(pencil: SymmetricPencil, probes: int) -> Callable[[Scalar], Count]:

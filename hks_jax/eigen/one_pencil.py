@@ -2,13 +2,14 @@
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from hks_jax.arrays import jax_array
 from hks_jax.checks import real_array, require_count
@@ -18,16 +19,21 @@ from hks_jax.eigen.derivative import frame_of_chosen, solved
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.inertia import certain_count, count_below, locate, translated
 from hks_jax.eigen.lanczos.block_lanczos import SLICE, BlockLanczos, known_by_weyl
-from hks_jax.eigen.quality import allowed_residuals, indistinct, largest_of, measure_pairs, measured_on_host
+from hks_jax.eigen.quality import allowed_residuals, indistinct, largest, largest_of, measure_pairs, measured_on_host
+from hks_jax.eigen.shift_invert.matrices import balanced, near_zero
 from hks_jax.eigen.shift_invert.shift_invert import ShiftInvert, lower_bound
 from hks_jax.eigen.solver import Dense, Eigensolver, Report
 from hks_jax.fem.nodal import on_all_nodes
 from hks_jax.fem.pencil import AnyPencil, Pencil
+from hks_jax.fem.space import MatrixSpace
 from hks_jax.linear.pencil import SymmetricPencil, tabulated
 from hks_jax.traced import is_traced
 
 _FAR = 30
 """The largest distance of the origin below the wanted eigenvalues, in units of the spread of these eigenvalues."""
+
+_COPIES = 1000
+"""The largest number of lowest eigenvalues that are all computed because rounding does not separate them."""
 
 
 def widened(pencil: AnyPencil, solvers: Sequence[Eigensolver], k: int) -> AnyPencil:
@@ -37,7 +43,7 @@ def widened(pencil: AnyPencil, solvers: Sequence[Eigensolver], k: int) -> AnyPen
 
 def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw: bool, report: Report) -> Eigenpairs:
     """Return the k lowest pairs and, if ``extra`` = 1, the next eigenvalue. See `solved` for ``throw``."""
-    n_dof = pencil.size
+    n_dof, pencil = pencil.size, _with_balance(pencil)
     if isinstance(solver, ShiftInvert) and not pencil.bounded and is_concrete_on_cpu(jax.lax.stop_gradient(pencil)):
         bound = lower_bound(jax.lax.stop_gradient(pencil))
         pencil = eqx.tree_at(lambda p: p.lower_bound, pencil, bound, is_leaf=lambda leaf: leaf is None)
@@ -48,11 +54,14 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
         )
     if k + extra > solver.max_pairs(n_dof) and pencil.null_space is None:
         solver = Dense(solver.tolerance)
-    elif k + extra > solver.max_pairs(n_dof):
+    elif k + extra > (most := solver.max_pairs(n_dof)):
+        if most < 2:
+            raise ValueError(
+                f"solver: got {solver.name!r} for {n_dof} unknowns, which are too few for it. Use the dense solver"
+            )
         raise ValueError(
             f"k: got {k}, for which {k + extra} pairs are needed (one more shows where the spectrum is cut); the "
-            f"{solver.name} solver computes at most {solver.max_pairs(n_dof)} of {n_dof} pairs. Use a smaller k "
-            "or the dense solver"
+            f"{solver.name} solver computes at most {most} of {n_dof} pairs. Use a smaller k or the dense solver"
         )
     from_bound = pencil.null_space is None and not solver.indefinite
     if not from_bound and (not isinstance(solver, BlockLanczos) or known_by_weyl(pencil)):
@@ -67,7 +76,7 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
         half = max(solver.plan(k).slice_size // 2, 1)
         origin, first, below = locate(jax.lax.stop_gradient(pencil), half, solver.block)
         reach, spacing = first - origin, (first - origin) / jnp.maximum(below, 1).astype(origin.dtype)
-        if not is_traced(below) and below > 2 * half:
+        if not is_traced(below) and 2 * half < below <= _COPIES:
             # The lowest eigenvalue has an unexpectedly high multiplicity. Compute all pairs that `locate` counted.
             number = max(k, int(below))
             method = solver if number + 1 <= solver.max_pairs(n_dof) else Dense(solver.tolerance)
@@ -109,7 +118,7 @@ def solve_interval(
 ) -> Eigenpairs:
     """Return the k eigenpairs in an interval."""
     low, high, below, held, k = interval
-    length = high - low
+    length, pencil = high - low, _with_balance(pencil)
     moved = translated(pencil, low, below, length / (2 * max(k / SLICE, 1)), length / max(k, 1))
     nothing = jnp.zeros((0, pencil.size), low.dtype)
     found = jnp.zeros(0, low.dtype), nothing, nothing, jnp.asarray(jnp.inf, low.dtype), length
@@ -154,6 +163,19 @@ def checked_interval(pencil: Pencil, interval: tuple[float, float], k: int | Non
     return Interval(low, high, below, held, count)
 
 
+def _with_balance(pencil: Pencil) -> Pencil:
+    """Return a float32 pencil of the user's own K with the null vectors of K that rounding hides; see `balanced`."""
+    known, own = jax.lax.stop_gradient(pencil), isinstance(pencil.space, MatrixSpace) or pencil.volume is None
+    if pencil.null_space is not None or not own or not _single_on_host(known.stiffness, known.stiffness):
+        return pencil
+    source = replace(known.unrounded, null_vectors=balanced(known))
+    return replace(pencil, source=source)
+
+
+def _single_on_host(values: Any, args: Any) -> bool:
+    return values.dtype == np.float32 and is_concrete_on_cpu(args)
+
+
 def _pairs(
     pencil: Pencil,
     solved_pencil: SymmetricPencil,
@@ -168,21 +190,25 @@ def _pairs(
     if values.size:
         matrices = tabulated(SymmetricPencil(solved_pencil.stiffness, solved_pencil.mass))
         held = jax.lax.stop_gradient((matrices, values, vectors, origin))
-        quality = _quality(*held, solved_pencil.n_null, solver.tolerance, known)
+        stored = solver.in_double and _single_on_host(values, held)
+        quality = _quality(*held, solved_pencil.n_null, solver.tolerance, known, stored)
     else:
         no = jnp.zeros(0, bool)
         quality = jnp.zeros(0, values.dtype), no, no, jnp.asarray(1e-6, values.dtype)
     residuals, converged, zero, tolerance = quality
+    small, rounding = _near_zero(*jax.lax.stop_gradient((solved_pencil, vectors, values, zero)), known, solver)
     # While differentiating, JAX may turn a constant array into a Python number.
     following, bound = jax_array(following), jax_array(bound)
     if not known:
-        values, following, bound = _translated(values, jax.lax.stop_gradient(values), zero, following, bound, origin)
+        constant = jax.lax.stop_gradient(values)
+        values, following, bound = _translated(values, constant, zero, small, following, bound, origin)
     return Eigenpairs(
         values,
         vectors,
         frame,
         residuals,
         converged,
+        rounding,
         kept=jax_array(np.ones(values.size, bool)),
         part=None,
         next_eigenvalue=following,
@@ -197,15 +223,46 @@ def _pairs(
 
 @numpy_where_known(jit_quickly())
 def _translated(
-    xp: Any, values: Any, constant: Any, zero: Any, following: Any, bound: Any, origin: Any
+    xp: Any, values: Any, constant: Any, zero: Any, small: Any, following: Any, bound: Any, origin: Any
 ) -> tuple[Any, Any, Any]:
-    """Add the origin to values and bounds. Zero eigenvalues become exactly zero, and keep their derivatives."""
-    return values + origin + xp.where(zero, -constant - origin, 0), following + origin, bound + origin
+    """Add the origin to values and bounds. Eigenvalues near zero become ``small``, and keep their derivatives."""
+    return values + origin + xp.where(zero, small + (-constant - origin), 0), following + origin, bound + origin
 
 
-@numpy_where_known(jit_quickly(static_argnames=("n_null", "tolerance", "known")), most=3 << 18)
+def _near_zero(
+    pencil: SymmetricPencil, vectors: Array, values: Array, zero: Array, known: bool, solver: Eigensolver
+) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
+    """Return the eigenvalues that are near zero, with 0 for the others, and `Eigenpairs.rounding`.
+
+    In float32, eigenvalues that are zero within rounding may be accurate in float64, in which the host computes.
+    """
+    nothing = jnp.zeros_like(values)
+    if values.dtype != np.float32 or not values.size:
+        return nothing, nothing
+    if not _single_on_host(values, (pencil, vectors, values)):
+        return nothing, nothing if known else jnp.where(zero, indistinct(pencil, values.dtype), 0)
+    small, rounding = np.zeros((2, values.size), np.float32)
+    where = np.flatnonzero(np.asarray(zero) & (np.arange(values.size) >= (pencil.n_null if known else 0)))
+    if where.size:
+        quotients, changes = near_zero(pencil, np.asarray(vectors)[where], solver.in_double)
+        # Rounding of the vectors to float32 changes quotients by its square.
+        exact = np.abs(quotients) <= np.finfo(np.float32).eps ** 2 * float(largest(pencil))
+        small[where], rounding[where] = np.where(exact, 0, quotients), np.where(exact, 0, changes)
+        small[where] = np.maximum.accumulate(small[where])
+    return jax.device_put((small, rounding))
+
+
+@numpy_where_known(jit_quickly(static_argnames=("n_null", "tolerance", "known", "stored")), most=3 << 18)
 def _quality(
-    xp: Any, pencil: Any, values: Any, vectors: Any, origin: Any, n_null: int, tolerance: float, known: bool
+    xp: Any,
+    pencil: Any,
+    values: Any,
+    vectors: Any,
+    origin: Any,
+    n_null: int,
+    tolerance: float,
+    known: bool,
+    stored: bool,
 ) -> tuple[Any, ...]:
     """Return residuals, convergence flags, flags of zero eigenvalues, and the multiplet tolerance.
 
@@ -220,6 +277,6 @@ def _quality(
     unit = values[min(n_null, k - 1)] if known else xp.where(xp.all(zero), size, (values[-1] - values[0]) / k)
     scale = xp.maximum(xp.abs(values), xp.abs(unit))
     scale = xp.where(scale > 0, scale, xp.where(size > 0, size, 1)).astype(values.dtype)
-    converged = (residuals <= allowed_residuals(scale, rounding, tolerance, xp)) & ~twice
+    converged = (residuals <= allowed_residuals(scale, rounding, tolerance, xp, stored)) & ~twice
     converged = converged & (values >= 0) if known else converged
     return residuals / scale, converged, zero, xp.clip(rounding / scale[-1], 1e-6, 1e-3).astype(values.dtype)

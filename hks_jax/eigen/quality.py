@@ -65,13 +65,14 @@ def measured_on_host(
     return values, residuals, twice
 
 
-def allowed_residuals(scale: Any, rounding: Any, tolerance: float, xp: Any = jnp) -> Any:
+def allowed_residuals(scale: Any, rounding: Any, tolerance: float, xp: Any = jnp, stored: bool = False) -> Any:
     """Return the largest residuals ‖Kφ − λMφ‖ / ‖Mφ‖ at which pairs count as converged.
 
     The tolerance is relative to ``scale``, the larger of |λ| and a typical eigenvalue. Residuals up to the level of
-    rounding are accepted too, but only up to one per cent of ``scale``, because a less accurate pair is useless.
+    rounding are accepted too, but only up to one per cent of ``scale``, because a less accurate pair is useless. If
+    the pairs were only ``stored`` in low precision, the residuals are those of the stored vectors, and have no limit.
     """
-    return xp.maximum(tolerance * scale, xp.minimum(rounding, _EXCUSED * scale))
+    return xp.maximum(tolerance * scale, rounding if stored else xp.minimum(rounding, _EXCUSED * scale))
 
 
 def indistinct(pencil: SymmetricPencil, dtype: np.dtype) -> Float[Array, ""]:

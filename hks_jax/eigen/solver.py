@@ -52,6 +52,7 @@ class Eigensolver(eqx.Module, Generic[P]):
     Attributes:
         name: the name of the method in reports.
         indefinite: whether the method supports a stiffness that is indefinite, or whose null space is unknown.
+        in_double: whether the method computes in float64 if values are concrete and on a CPU, whatever their dtype.
         adjoint: the linear solver for derivatives. The default, `FactorisedAdjoint`, needs a pencil that it can
             factorise.
         tolerance: the relative residual ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁) at which a pair counts as converged, or the
@@ -60,6 +61,7 @@ class Eigensolver(eqx.Module, Generic[P]):
 
     name: ClassVar[str]
     indefinite: ClassVar[bool] = True
+    in_double: ClassVar[bool] = False
     tolerance: eqx.AbstractVar[float]
     adjoint: Adjoint = eqx.field(default=FactorisedAdjoint(), static=True, kw_only=True)
 
@@ -93,6 +95,7 @@ class Dense(Eigensolver[SymmetricPencil]):
     """
 
     name: ClassVar[str] = "dense"
+    in_double: ClassVar[bool] = True
     tolerance: float = eqx.field(default=1e-8, static=True)
 
     def lowest(self, pencil: SymmetricPencil, k: int, report: Report = silent) -> RawPairs:

@@ -39,11 +39,13 @@ def assemble(
     midpoints: Any = None,
     quadrature: Quadrature = "gauss",
 ) -> AnyPencil:
-    """Assemble the generalized eigenproblem Kφ = λMφ of an operator, by default of the Laplace–Beltrami operator.
+    """Assemble the generalized eigenproblem Kφ = λMφ of the domain's operator, or of another operator.
 
-    With the metric T and the basis functions hᵢ, K_ij = ∫ √|T| T⁻¹∇hᵢ·∇hⱼ and M_ij = ∫ √|T| hᵢhⱼ (Zobel, Reininghaus
-    and Hotz, section 3). On grids the elements are Q1 with 2^d Gauss points, and T or its logarithm is interpolated
-    multilinearly (see `TensorField`). On meshes the elements are P1 or P2, and T is constant on each cell.
+    With the metric T and the basis functions hᵢ, K_ij = ∫ √|T| T⁻¹∇hᵢ·∇hⱼ dx and M_ij = ∫ √|T| hᵢhⱼ dx (Zobel,
+    Reininghaus and Hotz, section 3). A domain with ``operator="fick"`` has K_ij = ∫ D∇hᵢ·∇hⱼ dx and M_ij = ∫ hᵢhⱼ dx,
+    where dx replaces the volume element √|T| dx everywhere below, and D = T⁻¹ is interpolated. On grids the elements
+    are Q1 with 2^d Gauss points, and T or its logarithm is interpolated multilinearly (see `TensorField`). On meshes
+    the elements are P1 or P2, and T is constant on each cell.
 
     A *field* is a number, an array over the nodes, an array over the elements, or a function of position that JAX can
     trace. An array over the nodes, (*shape) or (V,), is interpolated. An array over the elements has n − 1 entries
@@ -61,7 +63,8 @@ def assemble(
             "periodic", "dirichlet")``. On meshes ``"neumann"``, ``"dirichlet"`` and ``"mean"`` act on the boundary.
         mass: ``"consistent"``, ``"lumped"`` (the diagonal matrix of row sums), or your own form.
         potential: a field V of either sign; the operator becomes −Δ + V.
-        density: a positive field ρ; the operator becomes −ρ⁻¹ div(ρ ∇·), in L² with the volume element ρ√|T| dx.
+        density: a positive field ρ; the operator becomes −ρ⁻¹ div(ρ ∇·), in L² with the volume element ρ√|T| dx. With
+            Fick's operator it is −ρ⁻¹ div(ρD∇·), with the volume element ρ dx.
         stiffness: your own form, which replaces potential and density: a function ``form(u, v, w)`` that is linear in u
             and in v and returns one number. The shape functions u and v have ``.value`` and ``.grad``. The point w has
             the metric ``.metric`` (d, d), its inverse ``.inverse``, the position ``.x`` and the fields ``w["name"]``.
@@ -111,6 +114,7 @@ def assemble(
             if is_given:
                 raise ValueError(f'quadrature: got "cancelling" with {what}; expected "gauss"')
         operator = operator._replace(cancelling=True)
+    operator = operator._replace(fick=getattr(domain, "operator", None) == "fick")
     nodes = None
     if isinstance(domain, SimplicialMesh):
         if boundary not in MESH_BOUNDARIES:
@@ -159,7 +163,7 @@ def assemble(
     pencils = [pencil_on(held, each, operator) for each in spaces]
     if midpoints is not None and not is_traced(pencils) and np.isnan(pencils[0].mass.diagonal()).any():
         raise ValueError("midpoints: got positions that fold or invert cells; move them closer to the straight edges")
-    return _joined(pencils, operator)
+    return _joined(pencils, operator, "mirror" in str(boundary))
 
 
 def _checked_operator(
@@ -195,7 +199,7 @@ def _checked_operator(
     return WeakForm(stiffness or laplace_beltrami, of_mass, mass == "lumped", components, own), given | named
 
 
-def _joined(pencils: list[Pencil], operator: WeakForm) -> AnyPencil:
+def _joined(pencils: list[Pencil], operator: WeakForm, mirrored: bool) -> AnyPencil:
     """Return the pencil, or the `MirrorPencil` of a doubled domain; check that the user's forms are symmetric."""
     if operator.own and operator.checked:
         for name in ("stiffness", "mass"):
@@ -205,6 +209,11 @@ def _joined(pencils: list[Pencil], operator: WeakForm) -> AnyPencil:
     if len(pencils) == 1:
         return pencils[0]
     if pencils[0].space.n_dof == pencils[-1].space.n_dof:
+        if mirrored:
+            raise ValueError(
+                'boundary: got "mirror", but the mask reaches no side of the grid, where the mirrors are. Pass "mean" '
+                "for the rim of the mask"
+            )
         raise ValueError('boundary: got "mean", but the domain has no rim; pass "neumann"')
     free = [pencil.space.free for pencil in pencils]
     including = (tuple(j for j in range(i + 1) if not (own & ~free[j]).any()) for i, own in enumerate(free))

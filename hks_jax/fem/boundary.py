@@ -153,7 +153,7 @@ def reflect(field: TensorField, width: int) -> TensorField:
     mask = None if grid.mask is None else np.pad(grid.mask, pad, mode="reflect")
     origin = [o - width * h for o, h in zip(grid.origin, grid.spacing, strict=True)]
     shape = [n + 2 * width for n in grid.shape]
-    return TensorField(Grid(shape, grid.spacing, origin, mask, components="all"), tensors, field.interpolation)
+    return field.with_tensors(tensors, Grid(shape, grid.spacing, origin, mask, components="all"))
 
 
 def crop(

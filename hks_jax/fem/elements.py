@@ -30,6 +30,7 @@ class Element:
 
 def element_matrices(
     metric: Float[Array, "q d d"],
+    density: Float[Array, " q"],
     element: Element,
     form: WeakForm,
     x: Float[Array, "q m"] | None,
@@ -38,11 +39,12 @@ def element_matrices(
 ) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
     """Return stiffness and mass of one element.
 
-    The metric T, the positions x and the fields are given at the quadrature points. If the frames ∂x/∂ξ are given,
+    The metric T, the density of the volume element (√|T| unless the operator is Fick's), the positions x and the fields
+    are given at the quadrature points. If the frames ∂x/∂ξ are given,
     gradients and metric in forms refer to the axes of space, otherwise to the element's coordinates ξ.
     """
     h, dh = jnp.asarray(element.values, metric.dtype), jnp.asarray(element.gradients, metric.dtype)
-    volume = jnp.asarray(element.weights, metric.dtype) * jnp.sqrt(spd.determinant(metric))
+    volume = jnp.asarray(element.weights, metric.dtype) * density
     inverse = spd.inverse(metric)
     if frames is not None:
         product = partial(jnp.einsum, precision="highest")
@@ -154,7 +156,7 @@ hourglass modes (alternating nodal values) have no energy."""
 # The mass makes nodal values of functions of norm 1 too large by the factor 1 + Σ μθₐ²/2, which `Pencil.read` corrects.
 def stiffness_point(metric: Float[Array, "d d"], spacing: Float[np.ndarray | Array, " d"]) -> Float[Array, ""]:
     """Return ξ² for the quadrature points ±ξ of the stiffness in a cell with this metric."""
-    s = metric * spacing[:, None] * spacing
+    s = metric * spacing[:, None] * spacing[None]
     d = len(s)
     s = d * s / jnp.trace(s)
     a = spd.adjugate(s)

@@ -1,7 +1,7 @@
 """Weak forms, the integrands of stiffness and mass, and their integrals over one element.
 
 A form is a function of two shape functions u and v and of a point w, written as in scikit-fem. A form is bilinear and
-symmetric in u and v, and is integrated with the volume element √|T| dx of the metric T.
+symmetric in u and v, and is integrated with the volume element √|T| dx of the metric T, or dx for Fick's operator.
 """
 
 from collections.abc import Callable, Mapping
@@ -67,6 +67,7 @@ class WeakForm(NamedTuple):
     components: int = 1  # the number of components of a function
     own: bool = False  # whether a form is the user's, so that no property of the operator is known
     cancelling: bool = False  # whether shape functions are evaluated where the leading error of signatures cancels
+    fick: bool = False  # whether the volume element is that of space, and D = T⁻¹ is interpolated
     checked: bool = True  # whether symmetry is checked after assembly; otherwise unsymmetric matrices become NaN
 
 
@@ -87,8 +88,8 @@ def integrate(form: Form, volume: Float[Array, " q"], functions: ShapeFunction, 
     """Integrate a form over one element, for all n² pairs of n shape functions.
 
     The shape functions have values (q, n, *c) and gradients (q, n, *c, d) at q quadrature points. Each of the q entries
-    of ``volume`` is the weight of a quadrature point times √|T|. A form that does not return one number, or that is not
-    linear in u, raises ValueError.
+    of ``volume`` is the weight of a quadrature point times the density of the volume element. A form that does not
+    return one number, or that is not linear in u, raises ValueError.
     """
     read = _reads(form, *(jax.tree.map(lambda leaf: leaf[0], each) for each in (functions, points)))
 

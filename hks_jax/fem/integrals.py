@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.checks import real_array
-from hks_jax.compilation import jit_quickly
+from hks_jax.compilation import jit_quickly, numpy_where_known
 from hks_jax.domain import spd
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.simplicial_mesh import SimplicialMesh, oriented
 from hks_jax.domain.tensor_checks import Interpolation
-from hks_jax.domain.tensor_field import TensorField
+from hks_jax.domain.tensor_field import TensorField, diffusion_tensors
 from hks_jax.fem.elements import MASS, Element, element_matrices, moved, simplex_element, tensor_product_element
 from hks_jax.fem.fields import Field
 from hks_jax.fem.forms import WeakForm
@@ -33,7 +33,7 @@ def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace
     """Return the pencil of a field, or of one part of a doubled domain."""
     # Masks, element and spacing are passed as arrays, so that problems that differ only in these arrays share one
     # compilation. The element is computed in double precision, since its rounding would scale the whole metric.
-    tensors, spacing = field.tensors, np.array(field.grid.spacing)
+    tensors, spacing = diffusion_tensors(field) if operator.fick else field.tensors, np.array(field.grid.spacing)
     element = tensor_product_element(space.dimension)
     table = element.gradients / spacing, element.weights * spacing.prod(), spacing
     gradients, weights, steps = (np.asarray(x, tensors.dtype) for x in table)
@@ -42,14 +42,21 @@ def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace
     x = grid_points(field.grid, space, tensors.dtype) if operator.own else None
     arrays = tensors, domain, elements, couplings, gradients, weights, steps
     *matrices, lumped, volume = _grid_integrals(*arrays, x, fields, *settings)
-    metric = SampledMetric(jax.lax.stop_gradient(tensors), steps, field.interpolation)
+    metric = SampledMetric(jax.lax.stop_gradient(field.tensors), steps, field.interpolation, operator.fick)
+    density = _root(tensors, domain) if operator.fick else None
     if operator.components > 1:
         own, kept = vector_space(space, operator.components), np.flatnonzero(space.elements)
         one, other = (gathered(own, each[kept]) for each in matrices)
         sums = row_sums_of(own, matrices[1][kept])
-        return assembled(one, other, sums, None, volume, own, operator, fields)
+        return assembled(one, other, sums, None, volume, None, own, operator, fields)
     stiffness, consistent = (StencilOperator(coefficients=each, space=space) for each in matrices)
-    return assembled(stiffness, consistent, lumped, metric, volume, space, operator, fields)
+    return assembled(stiffness, consistent, lumped, metric, volume, density, space, operator, fields)
+
+
+@numpy_where_known()
+def _root(xp: Any, tensors: Any, domain: Any) -> Any:
+    """Return √|D| at the nodes of the domain, and 1 elsewhere."""
+    return xp.sqrt(xp.where(domain, spd.determinant(tensors), 1))
 
 
 def grid_points(grid: Grid, space: GridSpace, dtype: Any) -> Float[Array, "*elements q d"]:
@@ -71,14 +78,22 @@ def _points_from(
 ) -> Float[Array, "*elements q d"]:
     low = jnp.moveaxis(jnp.indices(elements.shape), 0, -1).astype(first.dtype)
     low = jnp.where(elements[..., None], low, first)
-    return jnp.asarray(origin + spacing * (low[..., None, :] + inner))
+    inner, origin, spacing = (
+        jnp.reshape(x, (1,) * elements.ndim + (-1, low.shape[-1])) for x in (inner, origin, spacing)
+    )
+    return origin + spacing * (low[..., None, :] + inner)
 
 
 def _numpy_rule(args: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
-    """Compute the Laplace–Beltrami integrals, their tangents, or the cotangents of the tensors, with NumPy."""
+    """Compute the integrals without fields, their tangents, or the cotangents of the tensors, with NumPy."""
     tensors, domain, elements, couplings, gradients, weights, _, _, fields, periodic, interpolation, operator = args
-    plain = operator == WeakForm(lumped=operator.lumped) and interpolation == "linear" and not fields
-    if not plain or tensors.size > _ON_HOST or (x is not None and len(jax.tree.leaves(x)) > 1):
+    plain = operator == WeakForm(lumped=operator.lumped, fick=operator.fick) and not fields
+    if (
+        not plain
+        or interpolation != "linear"
+        or tensors.size > _ON_HOST
+        or (x is not None and len(jax.tree.leaves(x)) > 1)
+    ):
         return None
     d, n, dtype, shape = len(periodic), 2 ** len(periodic), tensors.dtype, domain.shape
     h, nodes = tensor_product_element(d).values.astype(dtype), np.asarray(tensors).reshape(-1, d, d)
@@ -96,32 +111,38 @@ def _numpy_rule(args: list[Any], x: list[Any] | None, y: list[Any] | None) -> An
         at_corners = (nodal * known)[cells].reshape(-1, n, d * d)
         return np.matmul(h, at_corners).reshape(-1, n, d, d)
 
-    def integrals(flux: np.ndarray, root: np.ndarray) -> tuple[Any, ...]:
-        of_elements = flux.reshape(len(cells), -1) @ of_stiffness, root @ of_mass
+    def integrals(flux: np.ndarray, density: np.ndarray, metric_density: np.ndarray) -> tuple[Any, ...]:
+        of_elements = flux.reshape(len(cells), -1) @ of_stiffness, density @ of_mass
         sums = (np.bincount(places.ravel(), each.ravel(), 3**d * domain.size) for each in of_elements)
         stiffness, mass = (each.astype(dtype).reshape(3**d, *shape) for each in sums)
-        lumped = mass.sum(axis=0)
-        return np.where(coupled, stiffness, 0), np.where(coupled, mass, 0), lumped, lumped.sum()
+        couplings = np.where(coupled, stiffness, 0), np.where(coupled, mass, 0)
+        return *couplings, mass.sum(axis=0), np.sum(metric_density @ weights)
 
-    # The integrands have d(√|T| T⁻¹) = √|T| (½ tr(T⁻¹dT) T⁻¹ − T⁻¹dT T⁻¹) and d√|T| = ½√|T| tr(T⁻¹dT).
-    metric = inside(nodes)
-    root, inverse = np.sqrt(spd.determinant(metric)), spd.inverse(metric)
-    flux, across = root[..., None, None] * inverse, np.swapaxes(inverse, -1, -2)
+    # The integrands of a metric T have d(√|T| T⁻¹) = √|T| (½ tr(T⁻¹dT) T⁻¹ − T⁻¹dT T⁻¹) and d√|T| = ½√|T| tr(T⁻¹dT).
+    # The integrands of Fick's operator, whose tensors are D, are D and 1, and |D|^(−½) for the volume of the metric.
+    given, fick = inside(nodes), operator.fick
+    root, inverse = np.sqrt(spd.determinant(given)), spd.inverse(given)
+    flux, across = given if fick else root[..., None, None] * inverse, np.swapaxes(inverse, -1, -2)
     if x is None:
-        return integrals(flux, root)
+        return integrals(flux, np.ones_like(root) if fick else root, 1 / root if fick else root)
     if y is None:
         change = inside(np.asarray(x[0]).reshape(-1, d, d))
         half = np.sum(across * change, axis=(-2, -1)) / 2
-        return integrals(half[..., None, None] * flux - flux @ change @ inverse, root * half)
-    stiffness, mass = np.where(coupled, y[0], 0), np.where(coupled, y[1], 0) + y[2] + y[3]
+        if fick:
+            return integrals(change, np.zeros_like(root), -half / root)
+        return integrals(half[..., None, None] * flux - flux @ change @ inverse, root * half, root * half)
+    stiffness, mass = np.where(coupled, y[0], 0), np.where(coupled, y[1], 0) + y[2]
     of_flux, of_root = (
         each.ravel()[places].reshape(-1, n * n) @ table.T
         for each, table in ((stiffness, of_stiffness), (mass, of_mass))
     )
-    of_flux = of_flux.reshape(metric.shape)
-    half = (np.sum(flux * of_flux, axis=(-2, -1)) + root * of_root) / 2
-    of_metric = half[..., None, None] * across - root[..., None, None] * across @ of_flux @ across
-    of_corners = np.matmul(h.T, of_metric.reshape(-1, n, d * d)).reshape(-1, d * d)
+    of_flux, of_volume = of_flux.reshape(given.shape), y[3] * weights
+    if fick:
+        of_tensors = of_flux - (of_volume / (2 * root))[..., None, None] * across
+    else:
+        half = (np.sum(flux * of_flux, axis=(-2, -1)) + root * (of_root + of_volume)) / 2
+        of_tensors = half[..., None, None] * across - root[..., None, None] * across @ of_flux @ across
+    of_corners = np.matmul(h.T, of_tensors.reshape(-1, n, d * d)).reshape(-1, d * d)
     sums = [np.bincount(cells.ravel(), each, domain.size) for each in of_corners.T]
     return [(np.stack(sums, axis=-1).reshape(-1, d, d) * known).astype(dtype).reshape(tensors.shape)]
 
@@ -153,6 +174,10 @@ def _grid_integrals(
     metric = at_points(Field(nodal, "nodes"))
     if interpolation == "log-euclidean":
         metric = jax.lax.optimization_barrier(spd.exp(jax.lax.optimization_barrier(metric)))
+    if operator.fick:  # the tensors are D
+        metric = spd.inverse(metric)
+    metric_density = jnp.sqrt(spd.determinant(metric))
+    density = jnp.ones_like(metric_density) if operator.fick else metric_density
     held = {name: at_points(field) for name, field in fields.items()}
     places = None if x is None else x.reshape(-1, *x.shape[-2:])
 
@@ -161,24 +186,24 @@ def _grid_integrals(
 
     points = replace(element, values=tensor_product_element(len(periodic), MASS).values)
 
-    def integrals(metric: Array, x: Array | None, fields: dict[str, Array]) -> tuple[Array, ...]:
+    def integrals(metric: Array, density: Array, x: Array | None, fields: dict[str, Array]) -> tuple[Array, ...]:
         if not operator.cancelling:
-            return element_matrices(metric, element, operator, x, fields)
+            return element_matrices(metric, density, element, operator, x, fields)
         alone = {name: field for name, field in fields.items() if name != "potential"}
-        energy, mass = element_matrices(metric, points, operator, x, alone)
+        energy, mass = element_matrices(metric, density, points, operator, x, alone)
         whole = moved(energy, metric, spacing)
         if "potential" in fields:
-            whole = whole + element_matrices(metric, points, operator, x, fields)[0] - energy
+            whole = whole + element_matrices(metric, density, points, operator, x, fields)[0] - energy
         return whole, mass
 
-    stiffness, mass = map(kept, jax.vmap(integrals)(metric, places, held))
+    stiffness, mass = map(kept, jax.vmap(integrals)(metric, density, places, held))
     if operator.components > 1:
         return stiffness, mass, jnp.sum(mass, axis=-1), jnp.zeros((), mass.dtype)
     stiffness, mass = (_stencil(each.reshape(*elements.shape, *each.shape[1:]), periodic) for each in (stiffness, mass))
     # The row sums include couplings to eliminated nodes, because only the sum of all basis functions is one.
     lumped = volumes = jnp.sum(mass, axis=0)
-    if "density" in fields:
-        volumes = kept((jnp.sqrt(spd.determinant(metric)) @ weights)[:, None, None])
+    if operator.fick or "density" in fields:
+        volumes = kept((metric_density @ weights)[:, None, None])
     volume = jnp.sum(volumes)
     if couplings is None:
         return stiffness, mass, lumped, volume
@@ -265,14 +290,30 @@ def assemble_mesh(
     }
     x, seen = (mesh_points(nodes, space), frames) if operator.own else (None, None)
 
+    density = metric_density = jnp.sqrt(spd.determinant(metric))
+    if operator.fick:  # the volume element is that of space
+        density = jnp.sqrt(spd.determinant(jnp.einsum("nqxa,nqxb->nqab", frames, frames, precision="highest")))
     integrals = jax.vmap(partial(element_matrices, element=element, form=operator))
-    stiffness, mass = integrals(metric, x=x, fields=held, frames=seen)
+    stiffness, mass = integrals(metric, density, x=x, fields=held, frames=seen)
     own = space if operator.components == 1 else vector_space(space, operator.components)
     lumped = volumes = row_sums_of(own, mass)
-    if "density" in fields:
-        volumes = jnp.sqrt(spd.determinant(metric)) @ element.weights.astype(metric.dtype)
+    weights, ratio = element.weights.astype(metric.dtype), None
+    if operator.fick or "density" in fields:
+        volumes = metric_density @ weights
+    if operator.fick:
+        ratio = _mean_over_cells(space, density**2 / metric_density @ weights, density @ weights)
     # The error of P1 elements is estimated from the lengths of edges. No error estimate is known for P2 elements.
     sampled = SampledMetric(jax.lax.stop_gradient(mesh.metric), None) if space.degree == 1 else None
-    return assembled(
-        gathered(own, stiffness), gathered(own, mass), lumped, sampled, jnp.sum(volumes), own, operator, fields
-    )
+    matrices = gathered(own, stiffness), gathered(own, mass)
+    return assembled(*matrices, lumped, sampled, jnp.sum(volumes), ratio, own, operator, fields)
+
+
+def _mean_over_cells(space: MeshSpace, weighted: Float[Array, " n"], weights: Float[Array, " n"]) -> Array:
+    """Return the weighted mean at each node over its cells, and 0 at nodes without cells."""
+
+    def total(values: Float[Array, " n"]) -> Array:
+        each = jnp.broadcast_to(values[:, None], space.cells.shape)
+        return jax.ops.segment_sum(each.ravel(), space.cells.ravel(), space.free.size)
+
+    sums = total(weights)
+    return (total(weighted) / jnp.where(sums > 0, sums, 1)).reshape(space.node_shape)

@@ -28,14 +28,18 @@ class Pencil(SymmetricPencil):
         stiffness: K; multiply with ``@``, or convert with ``.to_scipy()`` or ``.to_dense()``.
         mass: M, with the same methods.
         metric: the metric of the domain, for error estimates; None if it is not known.
-        volume: the area or volume of the domain in the units of the metric, including eliminated nodes; None if it is
-            not known.
+        volume: the area or volume of the domain in the units of the metric, including eliminated nodes, on which Weyl's
+            law depends; None if it is not known.
         space: the space of the functions.
         null_space: the null space of a positive semidefinite K; None if it is not known, and then K may be indefinite.
         lower_bound: a lower bound of the spectrum, if one is known for a K that may be indefinite; derivatives treat it
             as constant.
         row_sums: (n_dof,) the row sums of M over all nodes, from which `read` computes nodal values; infinite at nodes
             where functions vanish, and None if the unknowns are nodal values already.
+        weighted_volume: the integral of 1 with the mass, if a density or Fick's operator has another volume element
+            than the metric; None otherwise.
+        density: (*node_shape) the density √|D| of Fick's volume element dx with respect to that of the metric D⁻¹; None
+            for other operators.
     """
 
     metric: SampledMetric | None
@@ -43,6 +47,8 @@ class Pencil(SymmetricPencil):
     space: FunctionSpace = eqx.field(static=True)
     lower_bound: Float[Array, ""] | None = eqx.field(default=None, kw_only=True)
     row_sums: Float[Array, " n_dof"] | None = eqx.field(default=None, kw_only=True)
+    weighted_volume: Float[Array, ""] | None = eqx.field(default=None, kw_only=True)
+    density: Float[Array, "*node_shape"] | None = eqx.field(default=None, kw_only=True)
 
     def __repr__(self) -> str:
         return f"Pencil({self.space!r})"
@@ -56,6 +62,11 @@ class Pencil(SymmetricPencil):
     def measured(self) -> bool:
         """Whether dimension and volume are known, which Weyl's law requires."""
         return self.volume is not None and self.space.dimension is not None
+
+    @property
+    def measure(self) -> Float[Array, ""] | None:
+        """The integral of 1 with the mass, including eliminated nodes; None if it is not known."""
+        return self.volume if self.weighted_volume is None else self.weighted_volume
 
     @property
     def resolution(self) -> Resolution | None:
@@ -89,13 +100,13 @@ class Pencil(SymmetricPencil):
                 "stiffness: got a matrix whose sparsity pattern is not that of the pencil; use `sparse_pencil` for "
                 "matrices of other patterns"
             )
-        return replace(self, stiffness=stiffness, null_space=None, lower_bound=None)
+        return replace(self, stiffness=stiffness, source=None, null_space=None, lower_bound=None)
 
     def counted_from(self, origin: Float[Array, ""]) -> "Pencil":
         """Return the pencil of K − σM and M with an empty null space, where σ = ``origin`` is below the spectrum."""
-        moved = self.stiffness.with_flat(self.shifted(origin))
+        moved, source = self.moved_by(origin)
         nothing = NullSpace(jnp.zeros((0, self.size), origin.dtype))
-        return replace(self, stiffness=moved, null_space=nothing, lower_bound=None, row_sums=None)
+        return replace(self, stiffness=moved, source=source, null_space=nothing, lower_bound=None, row_sums=None)
 
     @property
     def parts(self) -> tuple["Pencil", ...]:
@@ -157,8 +168,18 @@ class MirrorPencil(eqx.Module):
 
     @property
     def volume(self) -> Float[Array, ""] | None:
-        """The area or volume of the doubled domain."""
+        """The area or volume of the doubled domain in the units of the metric."""
         return None if self.parts[0].volume is None else len(self.parts) * self.parts[0].volume
+
+    @property
+    def measure(self) -> Float[Array, ""] | None:
+        """The integral of 1 over the doubled domain with the mass."""
+        return None if self.parts[0].measure is None else len(self.parts) * self.parts[0].measure
+
+    @property
+    def density(self) -> Float[Array, "*node_shape"] | None:
+        """The density of Fick's volume element with respect to that of the metric; None for other operators."""
+        return self.parts[0].density
 
 
 AnyPencil: TypeAlias = Pencil | MirrorPencil
@@ -180,6 +201,7 @@ def assembled(
     lumped: Float[Array, "*node_shape"],
     metric: SampledMetric | None,
     volume: Float[Array, ""],
+    density: Float[Array, "*node_shape"] | None,
     space: FunctionSpace,
     operator: WeakForm,
     fields: dict[str, Field],
@@ -194,7 +216,9 @@ def assembled(
     else:
         nulls = _constants(space, lumped)
     sums = space.restrict(lumped) if operator.cancelling else None
-    return Pencil(stiffness, mass, metric, volume, space, null_space=nulls, lower_bound=bound, row_sums=sums)
+    weighted = jnp.sum(lumped) if operator.fick or "density" in fields else None
+    known: dict[str, Any] = {"null_space": nulls, "lower_bound": bound, "row_sums": sums, "density": density}
+    return Pencil(stiffness, mass, metric, volume, space, **known, weighted_volume=weighted)
 
 
 # With a potential V and a density ρ, the stiffness is K = A + ∫ρV hᵢhⱼ, where A ⪰ 0. If the potential is at least v at
@@ -215,7 +239,7 @@ def _constants(space: FunctionSpace, values: Array) -> NullSpace:
         vectors = numbers.ones((n_null, space.n_dof), values.dtype)
     else:
         number = numbers.arange(n_null, dtype=np.int32)[:, None]
-        vectors = (numbers.asarray(labels, np.int32) == number).astype(values.dtype)
+        vectors = (numbers.asarray(labels, np.int32)[None] == number).astype(values.dtype)
     return NullSpace(jax_array(vectors), fixed=True)
 
 

@@ -21,6 +21,7 @@ class SampledMetric(eqx.Module):
     tensors: Float[Array, "*shape d d"]  # the metric at grid nodes, or on mesh cells in the basis of the cell's edges
     spacing: Float[np.ndarray | Array, " d"] | None  # the spacing of the grid; None on a mesh
     interpolation: Interpolation = eqx.field(static=True, default="linear")
+    fick: bool = eqx.field(static=True, default=False)  # whether the operator is Fick's, with D = T⁻¹
 
 
 class Resolution(eqx.Module):
@@ -28,8 +29,10 @@ class Resolution(eqx.Module):
 
     mesh_width: Float[Array, "*shape"]  # the distance between neighbouring nodes in the units of the metric
     dispersion: Float[Array, "*shape"]  # the coefficient a (a length²) of the bias (a/t)^order for constant tensors
+    of_eigenvalues: Float[Array, "*shape"]  # the part of the bias's coefficient of 1/t that is due to eigenvalues
     turning: Float[Array, "*shape"]  # the relative error of eigenvalues that varying tensors cause
     swelling: Float[Array, ""]  # the relative error of the domain's area or volume
+    unevenness: Float[Array, ""]  # the standard deviation over the domain of the relative error of the volume element
     order: int = eqx.field(static=True, default=1, kw_only=True)  # the exponent of a/t: 2 if the leading error cancels
 
 
@@ -37,7 +40,7 @@ def resolution_of(metric: SampledMetric, space: FunctionSpace, lumped: bool, can
     """Return the resolution of the functions of a space, from the spacing of a grid or the edges of a mesh."""
     if isinstance(space, GridSpace):
         domain = mask_for(metric.tensors, space.domain)
-        settings = space.periodic, metric.interpolation, lumped, cancelling
+        settings = space.periodic, metric.interpolation, lumped, cancelling, metric.fick
         return Resolution(*_of_grid(metric.tensors, domain, metric.spacing, *settings), order=1 + cancelling)
     assert isinstance(space, MeshSpace)
     return _of_mesh(metric.tensors, space.triangulation.cells, space.triangulation.n_vertices, lumped)
@@ -54,26 +57,40 @@ def resolution_of(metric: SampledMetric, space: FunctionSpace, lumped: bool, can
 # E λkₐ² = (d + 2)gₐₐ/4t² in d dimensions, a lumped mass adds d/24 Σₐ hₐ²gₐₐ/t to the relative error of the signature.
 # The code has 1/20 in place of 1/24, to include terms of higher order in h²/t at t = 6h².
 #
+# The part −t E λδ is due to eigenvalues. `truncation` weights this part and the rest by moments of λt, because few
+# eigenvalues contribute at large t: beside Dirichlet sides the relative error of the lowest eigenvalue, times t, is
+# also the error of the signature.
+#
 # If the leading error cancels (hks_jax/fem/elements.py) and the metric is diagonal, the error of the eigenvalue is
 # λδ = −Σₐ hₐ⁴ g^aa kₐ⁶/240, and the squared nodal values have the factor 1 + (Σₐ hₐ²kₐ²)²/576. Since E kₐ⁶ = 15gₐₐ³/8t³
 # for the wave vector k, the relative error of the signature is
 #
 #     Σₐ hₐ⁴gₐₐ²/128t² + Σₐᵦ hₐ²hᵦ² (gₐₐgᵦᵦ + 2gₐᵦ²)/2304t².
 #
-# For a metric that is not diagonal, the error is half to twice as large as the formula for a diagonal metric.
-def _dispersion(xp: Any, tensors: Any, spacing: Any, lumped: bool, cancelling: bool) -> Any:
+# For a metric that is not diagonal, the error is half to twice as large as the formula for a diagonal metric. The error
+# of single eigenvalues is of second order: −Σ_{a<b} g^ab kₐkᵦ (hₐ²kₐ² + hᵦ²kᵦ²)/6 cancels only in the mean over the
+# heat kernel. Since E kₐ³kᵦ = 3gₐₐgₐᵦ/4t², the sum of its terms' sizes, times t, is Σ_{a<b}
+# |g^ab gₐᵦ| (hₐ²gₐₐ + hᵦ²gᵦᵦ)/8t.
+def _dispersion(xp: Any, tensors: Any, spacing: Any, lumped: bool, cancelling: bool) -> tuple[Any, Any]:
+    """Return the coefficients `Resolution.dispersion` and `Resolution.of_eigenvalues`."""
     inverse, d = spd.inverse(tensors), tensors.shape[-1]
     if cancelling:
         scaled = tensors * spacing[:, None] * spacing
         along = xp.stack([scaled[..., a, a] for a in range(d)], axis=-1)
         mixed = along.sum(-1) ** 2 + 2 * (scaled**2).sum((-2, -1))
-        return xp.sqrt((along**2).sum(-1) / 128 + mixed / 2304)
+        oblique = xp.zeros(tensors.shape[:-2], tensors.dtype)
+        for a, b in combinations(range(d), 2):
+            size = xp.abs(inverse[..., a, b] * tensors[..., a, b])
+            oblique = oblique + size * (along[..., a] + along[..., b]) / 8
+        return xp.sqrt((along**2).sum(-1) / 128 + mixed / 2304), oblique
     of_mass = 1 / 12 + (d / 20 if lumped else 0)
-    total = xp.zeros(tensors.shape[:-2], tensors.dtype)
+    total = of_eigenvalues = xp.zeros(tensors.shape[:-2], tensors.dtype)
     for a in range(d):
         along = tensors[..., a, a]
-        total = total + spacing[a] ** 2 * along * (of_mass - inverse[..., a, a] * along / 16)
-    return total
+        of_stiffness = inverse[..., a, a] * along / 16
+        total = total + spacing[a] ** 2 * along * (of_mass - of_stiffness)
+        of_eigenvalues = of_eigenvalues + spacing[a] ** 2 * along * of_stiffness
+    return total, (total if lumped else of_eigenvalues)
 
 
 # Between neighbours along axis a, the flux matrix A = √|T| T⁻¹ changes by δA, and an element uses the mean of A. The
@@ -81,10 +98,12 @@ def _dispersion(xp: Any, tensors: Any, spacing: Any, lumped: bool, cancelling: b
 # vector of axis a. An element lacks the energy of the corrector w, Aₐₐ(∂ₐ²w)² hₐ²/12. For gradients p with the
 # covariance A⁻¹, the missing energy is δAeₐ·A⁻¹δAeₐ/12Aₐₐ, relative to the energy of p along one axis. The estimate
 # holds for √t above the length on which the metric varies; for smaller t only its order of magnitude is right.
-def _turning(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...]) -> Any:
+# Fick's operator has the flux matrix A = D = T⁻¹.
+def _turning(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...], fick: bool) -> Any:
     """Return the relative error (*shape) of eigenvalues due to the variation of tensors between neighbours."""
-    root = xp.sqrt(spd.determinant(tensors))[..., None, None]
-    flux, reciprocal = spd.adjugate(tensors) / root, tensors / root
+    determinant = spd.determinant(tensors)[..., None, None]
+    root = determinant if fick else xp.sqrt(determinant)
+    flux, reciprocal = spd.adjugate(tensors) / root, tensors * (root / determinant)
     total = xp.zeros(tensors.shape[:-2], tensors.dtype)
     for a, wraps in enumerate(periodic):
         jump = xp.roll(flux[..., a], -1, a) - flux[..., a]
@@ -99,22 +118,35 @@ def _turning(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...]) -> 
 
 # At distance ξ from one of two nodes with the spacing h, linear interpolation has the error ξ(h − ξ)/2 times the second
 # derivative of the interpolated quantity. The mean of ξ(h − ξ)/2 between the nodes is h²/12. The relative error of the
-# density √|T| is half the trace of T⁻¹ times the error of T. The relative error of the volume is therefore proportional
-# to tr T⁻¹∂ₐ²T if T is interpolated, and to ∂ₐ²log|T| if log T is interpolated.
-def _swelling(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...], interpolation: Interpolation) -> Any:
+# density √|T| is half the trace of T⁻¹ times the error of T. The relative error of the volume element is therefore
+# Σₐ hₐ² tr(T⁻¹∂ₐ²T)/24 if T is interpolated, and Σₐ hₐ² ∂ₐ²log|T|/24 if log T is interpolated.
+def _swelling(
+    xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...], interpolation: Interpolation
+) -> tuple[Any, Any]:
+    """Return the size of the mean of the volume element's relative error, and its standard deviation."""
     determinant, inverse = spd.determinant(tensors), spd.inverse(tensors)
-    density, total = xp.sqrt(determinant), xp.zeros((), tensors.dtype)
+    density = xp.sqrt(determinant)
+    total, inner = xp.zeros((), tensors.dtype), domain
+    of_nodes = xp.zeros(domain.shape, tensors.dtype)
     for a, wraps in enumerate(periodic):
         if interpolation == "linear":
             second = xp.roll(tensors, 1, a) + xp.roll(tensors, -1, a) - 2 * tensors
-            error = (inverse * second).sum((-2, -1))  # both matrices are symmetric
+            error = (inverse * second).sum((-2, -1)) / 24  # both matrices are symmetric
         else:
             logarithm = xp.log(determinant)
-            error = xp.roll(logarithm, 1, a) + xp.roll(logarithm, -1, a) - 2 * logarithm
+            error = (xp.roll(logarithm, 1, a) + xp.roll(logarithm, -1, a) - 2 * logarithm) / 24
         pairs = _neighbours(xp, domain, a, wraps)
-        weight = xp.where(pairs & xp.roll(pairs, 1, a), density, 0)
-        total = total + xp.sum(weight * error) / 24 / xp.maximum(xp.sum(weight), xp.finfo(tensors.dtype).tiny)
-    return xp.abs(total)
+        between = pairs & xp.roll(pairs, 1, a)
+        total, inner = total + _mean(xp, error, xp.where(between, density, 0)), inner & between
+        of_nodes = of_nodes + error
+    weight = xp.where(inner, density, 0)
+    variance = _mean(xp, (of_nodes - _mean(xp, of_nodes, weight)) ** 2, weight)
+    return xp.abs(total), xp.sqrt(variance)
+
+
+def _mean(xp: Any, x: Any, weight: Any) -> Any:
+    """Return the weighted mean, or 0 if all weights are 0."""
+    return xp.sum(weight * x) / xp.maximum(xp.sum(weight), xp.finfo(x.dtype).tiny)
 
 
 def _neighbours(xp: Any, domain: Any, axis: int, wraps: bool) -> Any:
@@ -126,7 +158,7 @@ def _neighbours(xp: Any, domain: Any, axis: int, wraps: bool) -> Any:
     return pairs & (xp.arange(n) < n - 1).reshape([-1 if a == axis else 1 for a in range(domain.ndim)])
 
 
-@numpy_where_known(static_argnums=(3, 4, 5, 6))
+@numpy_where_known(static_argnums=(3, 4, 5, 6, 7))
 def _of_grid(
     xp: Any,
     tensors: Any,
@@ -136,15 +168,19 @@ def _of_grid(
     interpolation: Interpolation,
     lumped: bool,
     cancelling: bool,
+    fick: bool,
 ) -> tuple[Any, ...]:
     tensors = xp.where(domain[..., None, None], tensors, xp.eye(tensors.shape[-1], dtype=tensors.dtype))
     along = [spacing[a] ** 2 * tensors[..., a, a] for a in range(tensors.shape[-1])]
-    return (
-        xp.sqrt(xp.max(xp.stack(along), axis=0)),
-        _dispersion(xp, tensors, spacing, lumped, cancelling),
-        _turning(xp, tensors, domain, periodic),
-        _swelling(xp, tensors, domain, periodic, interpolation),
-    )
+    turning = _turning(xp, tensors, domain, periodic, fick)
+    measured = spd.inverse(tensors) if fick else tensors
+    swelling, unevenness = _swelling(xp, measured, domain, periodic, interpolation)
+    if fick:
+        # Fick's volume element is exact. An error of √|D| is one of the eigenvalues to the power d/2, and so of the
+        # signature, proportional to λ^(d/2) at small times.
+        turning, swelling, unevenness = turning + swelling, xp.zeros_like(swelling), xp.zeros_like(unevenness)
+    width = xp.sqrt(xp.max(xp.stack(along), axis=0))
+    return width, *_dispersion(xp, tensors, spacing, lumped, cancelling), turning, swelling, unevenness
 
 
 _BIAS = (0.03, 0.22)
@@ -166,4 +202,5 @@ def _of_mesh(
     longest = jnp.repeat(jnp.max(squared, axis=1), d + 1)
     at_vertices = jnp.maximum(jax.ops.segment_max(longest, cells.ravel(), n_vertices), 0)
     bias = _BIAS[lumped] * at_vertices
-    return Resolution(jnp.sqrt(at_vertices), bias, jnp.zeros_like(bias), jnp.zeros((), bias.dtype))
+    nothing = jnp.zeros((), bias.dtype)
+    return Resolution(jnp.sqrt(at_vertices), bias, bias, jnp.zeros_like(bias), nothing, nothing)

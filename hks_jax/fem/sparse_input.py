@@ -61,7 +61,8 @@ def sparse_pencil(
         M: a symmetric positive definite matrix of the same kinds, or its diagonal (n,); None is the identity. The
             sparsity patterns of M and K may differ.
         null_vectors: (m, n) a basis of the whole null space of K ⪰ 0, where m may be 0. If no basis is given, K may be
-            indefinite, and eigenvalues that are zero within rounding are set to zero.
+            indefinite, and eigenvalues that are zero within rounding are set to zero. In float32, a component of K
+            whose rows sum to zero within rounding counts as a graph Laplacian (docs/accuracy.md).
         dimension: the dimension of the manifold, 2 or 3; Weyl's law and ``normalisation="flat"`` need this number.
         volume: the volume of the manifold in the units of the metric, for Weyl's law and ``normalisation="volume"``.
         shape: the shape of nodal arrays, with n nodes; None is (n,).

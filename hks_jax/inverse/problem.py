@@ -19,7 +19,7 @@ from hks_jax.inverse.observation import Observation
 from hks_jax.inverse.regulariser import Regulariser
 from hks_jax.inverse.signature import TAIL, pairs_below, unknowns_of
 from hks_jax.inverse.unknowns import Unknowns, Values
-from hks_jax.signatures.truncation import resolving
+from hks_jax.signatures.truncation import resolving, truncation
 
 _NEAR = 0.1
 """A warning is issued if truncation causes more than a tenth of the misfit, that is, a third of the residuals."""
@@ -106,6 +106,23 @@ def _in_single(tree: Any) -> Any:
 def outcome_of(problem: Problem, values: Values) -> Outcome:
     """Return loss, misfit and eigenpairs at given unknowns."""
     return problem.evaluate(values)[2]
+
+
+def discretisation_misfit(problem: Problem, outcome: Outcome) -> float:
+    """Estimate the misfit between the metric's signatures on the grid and in the continuum; NaN if it is not known.
+
+    The estimate is half the weighted sum of squares of the residuals between the target and the target with the
+    relative error `Truncation.resolution_bias`, which is that of the median node.
+    """
+    observation = problem.observation
+    if observation.signature.left_out is None:
+        return math.nan
+    pencil = assemble(problem.unknowns.field(outcome.values), problem.boundary)
+    pairs = eqx.tree_at(lambda p: p.pencil, outcome.pairs, pencil, is_leaf=lambda x: x is None)
+    times, which = np.unique(observation.observed_times, return_inverse=True)
+    bias = truncation(pairs, times).resolution_bias[which]
+    residuals = observation.root_weights * observation.loss((1 + bias) * observation.target, observation.target)
+    return float(jnp.sum(residuals**2) / 2)
 
 
 def truncation_shows(misfit: float, left: float) -> bool:

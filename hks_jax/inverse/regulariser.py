@@ -84,7 +84,7 @@ class TotalVariation(Regulariser):
                 for along, slopes in enumerate(unknowns.slopes(values))
             ]
         )
-        square = jnp.sum(gradient**2, axis=(0, 1))
+        square = jnp.sum(gradient**2, axis=(0, 1), keepdims=True)
         # For the gradient's norm s, 2/(√(s² + ε²) + ε) equals 2(√(s² + ε²) − ε)/s² without cancellation.
         return gradient * jnp.sqrt(2 / (jnp.sqrt(square + self.epsilon**2) + self.epsilon))
 

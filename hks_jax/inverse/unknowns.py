@@ -108,7 +108,7 @@ def _rotation(vector: Float[Array, "n 3"]) -> Tensors:
     o = jnp.zeros_like(x)
     cross = jnp.stack([jnp.stack(row, axis=-1) for row in ((o, -z, y), (z, o, -x), (-y, x, o))], axis=-2)
     square_of_cross = jnp.matmul(cross, cross, precision="highest")
-    return jnp.eye(3, dtype=vector.dtype) + sinc[:, None, None] * cross + versine[:, None, None] * square_of_cross
+    return jnp.eye(3, dtype=vector.dtype)[None] + sinc[:, None, None] * cross + versine[:, None, None] * square_of_cross
 
 
 def _zeros(counts: tuple[int, int], base: Tensors) -> Parameters:
@@ -167,7 +167,7 @@ class Nodal(Unknowns):
         all_tensors = self.init.domain_tensors.reshape(-1, grid.dimension, grid.dimension)
         moved = self.parametrisation.tensors(values, self._base)
         full = all_tensors.at[self.nodes.value].set(moved)
-        return TensorField(grid, full.reshape(self.init.domain_tensors.shape), self.init.interpolation)
+        return self.init.with_tensors(full.reshape(self.init.domain_tensors.shape))
 
     def slopes(self, values: Values) -> list[Float[Array, "c *edges"]]:
         """Return the parameters' slopes along the grid's edges of each axis, and 0 for edges that leave the domain."""
@@ -219,7 +219,7 @@ class Free(Unknowns):
         if isinstance(tensors, TensorField):
             return tensors
         assert self.init is not None
-        return TensorField(self.init.grid, tensors, self.init.interpolation)
+        return self.init.with_tensors(tensors)
 
 
 def unknowns_for(parametrisation: str | Parametrisation | Free, init: TensorField, domain: np.ndarray) -> Unknowns:

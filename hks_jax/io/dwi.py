@@ -1,4 +1,4 @@
-"""Fit diffusion tensors to diffusion-weighted images by DIPY, and find an installed example brain."""
+"""Fit diffusion tensors to diffusion-weighted images, and find an installed example brain."""
 
 import importlib.metadata
 import os
@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
+from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import require_number
 from hks_jax.io import nifti
 from hks_jax.io.masks import mask_on
-from hks_jax.io.tensor_order import Matrices, pack, to_voxel_axes, unpack
-from hks_jax.io.units import MM2_PER_S, UNITS, Unit, b_value_question
+from hks_jax.io.tensor_order import Matrices, indices, pack, to_voxel_axes, unpack
+from hks_jax.io.units import MM2_PER_S, UNITS, Unit, b_value_question, median_mean_diffusivity
 from hks_jax.io.volume import TensorVolume, digest, placed
 from hks_jax.optional import optional
 from hks_jax.storage import existing, reading
@@ -23,6 +24,21 @@ _LENGTH = 0.05
 """The largest difference of a direction's length from 1 that is attributed to rounding."""
 _SEEN = 0.01
 """The least ratio of a residual's variance to the variance of the noise for which the residual is used."""
+_UNKNOWNS = 7
+"""The unknowns of a voxel: six components of the tensor, and the logarithm of the unweighted signal."""
+_DETERMINED = 0.05
+"""The least singular value of the design matrix, with b-values relative to the largest, for which unknowns count as
+determined. At this value, noise of 1 % in the signals changes the tensor by 0.2 divided by the largest b-value."""
+_UNWEIGHTED = 0.02
+"""The b-value, relative to the largest, up to which an image needs no direction: it then counts as unweighted."""
+_TENSOR_MODEL = 1500.0
+"""The b-value, in s/mm², up to which a tensor describes the signal of living tissue."""
+_FOR_MASK = 50.0
+"""The b-value, in s/mm², up to which images serve to find the brain."""
+_AT_ONCE = 10_000
+"""The number of voxels that are fitted at once, which limits the memory."""
+_FAINT = 1e-8
+"""The least weight of a measured signal in a voxel, relative to the voxel's largest."""
 
 
 class ExampleBrain(NamedTuple):
@@ -66,15 +82,20 @@ def fit_dwi(
     unit: Unit | None = None,
     noise: float | Literal["residuals"] | None = None,
 ) -> TensorVolume:
-    """Fit diffusion tensors to diffusion-weighted images by weighted least squares on log signals (DIPY's TensorModel).
+    """Fit diffusion tensors to diffusion-weighted images by weighted least squares on log signals.
+
+    The unknowns of a voxel are the tensor and the unweighted signal. The fit needs images of at least two b-values, but
+    none at b = 0. A signal that is not finite or not positive was not measured, and has no weight in the fit.
 
     Args:
-        path: a NIfTI image (nx, ny, nz, n). Voxels with a NaN or infinite signal are left out.
+        path: a NIfTI image (nx, ny, nz, n).
         bval: a text file of the n b-values, in s/mm² unless `unit` is given.
-        bvec: a text file of the n gradient directions, 3 × n or n × 3. Directions must have length 1, except at b = 0.
+        bvec: a text file of the n gradient directions, 3 × n or n × 3. Directions must have length 1, except for images
+            with at most 2 % of the largest b-value, which count as unweighted if their direction has another length.
         mask: a file (see `read_mask`) or a bool array (nx, ny, nz). Tensors outside the mask are zero. If `mask` is
-            None, DIPY's median_otsu finds the brain in the mean of the unweighted images.
+            None, DIPY's median_otsu finds the brain in the mean of the images with b ≤ 50, or with the lowest b-value.
         b_max: the largest b-value used, in s/mm², or None for all. The tensor model is valid for b ≲ 1000–1500 s/mm².
+            An `AccuracyWarning` reports larger b-values, unless diffusion is so slow that they are small for it.
         bvec_frame: the axes along which the gradient directions are given. ``"fsl"``, for files of dcm2niix and FSL,
             means the voxel axes, where the first axis is reversed if the affine's determinant is positive. ``"voxel"``
             means the voxel axes. ``"world"`` means the scanner's axes, as in MRtrix.
@@ -86,16 +107,19 @@ def fit_dwi(
             24 bytes for each voxel and image). If `noise` is None, no covariance is computed.
 
     Returns:
-        Tensors along the voxel axes, in mm²/s. If `noise` is given, the volume also describes the noise of the tensors
-        to first order (`TensorVolume.noise`). DIPY raises eigenvalues that are not positive to about 1e-9 mm²/s. A note
-        reports the number of voxels with raised eigenvalues; most lie at the boundary of the mask, see `erode`.
+        Tensors along the voxel axes, in mm²/s, as the fit gives them: some may not be positive definite, mostly at the
+        boundary of the mask (see `erode` and `repair_tensors`). If `noise` is given, the volume also describes the
+        noise of the tensors to first order (`TensorVolume.noise`). Notes list the b-values, count the signals that were
+        not measured, and count the voxels inside the mask that are left out because the others do not determine the
+        tensor.
 
     Raises:
-        ImportError: DIPY or nibabel is missing.
+        ImportError: nibabel is missing, or DIPY without a mask.
         FileNotFoundError: a file does not exist.
         ValueError: the numbers of images, b-values and directions differ; the b-values have another unit; a direction
-            of a weighted image does not have length 1; the mask has another shape; there are too few images for the
-            fit, or for an estimate of the noise; all residuals of a voxel are zero; there is no signal.
+            of a weighted image does not have length 1; the b-values and directions do not determine a tensor; the mask
+            has another shape; there are too few images for an estimate of the noise; all residuals of a voxel are zero;
+            an image has no positive signal inside the mask.
 
     Examples:
         >>> files = [folder / name for name in ("dwi.nii", "dwi.bval", "dwi.bvec")]
@@ -103,8 +127,7 @@ def fit_dwi(
         >>> print(volume.tensors[0, 0, 0].diagonal().round(6))  # mm²/s
         [0.001 0.001 0.001]
     """
-    dti, gradients = optional("dipy.reconst.dti"), optional("dipy.core.gradients")
-    name = os.fspath(path)
+    name, table = os.fspath(path), f"{os.fspath(bval)}, {os.fspath(bvec)}"
     image = nifti.load(name)
     affine, _ = nifti.affine_in_mm(name, image)
     b, directions = np.atleast_1d(_numbers(bval).squeeze()), np.atleast_2d(_numbers(bvec, may_be_nan=True))
@@ -115,29 +138,38 @@ def fit_dwi(
             f"path, bval, bvec: got an image of shape {image.shape}, {b.size} b-values and directions of shape "
             f"{directions.shape}; expected an image (nx, ny, nz, n), n b-values and directions (n, 3)"
         )
+    if b.min() < 0:
+        raise ValueError(f"{os.fspath(bval)}: got the b-value {b.min():g}; expected numbers from 0")
     if question := b_value_question(float(b.max()), unit or "mm2/s"):
         raise ValueError(f"{os.fspath(bval)}: {question}")
     b = b / UNITS[unit or "mm2/s"]
     used = np.full(b.size, True) if b_max is None else b <= b_max
-    threshold = max(50.0, float(b.min()))
-    weighted = int((used & (b > threshold)).sum())
-    if weighted < 6 or weighted == used.sum():
+    if not used.any():
+        raise ValueError(f"b_max: got {b_max}, which leaves no image; the b-values begin at {b.min():g}. Raise it")
+    all_images, images, b, directions = b.size, np.flatnonzero(used), b[used], directions[used]
+    b, directions, remarks = _directed(os.fspath(bvec), b, directions, images)
+    largest = float(b.max()) or 1.0
+    design = _design(b / largest, directions)  # the unknown components are multiplied by the largest b-value
+    _require_determined(table, design, b, directions, b_max)
+    if noise == "residuals" and b.size <= _UNKNOWNS:
         raise ValueError(
-            f"b_max: got {b_max}, which leaves {weighted} weighted and {int(used.sum()) - weighted} unweighted images; "
-            "expected at least 6 weighted images and 1 unweighted image. Raise the limit"
+            f'noise: got "residuals" with {b.size} images, but a tensor and the unweighted signal are {_UNKNOWNS} '
+            f"unknowns; expected at least {_UNKNOWNS + 1} images, and 15 for an estimate with an error of 25 %. Give "
+            "the standard deviation of the noise as a number"
         )
-    directions, remarks = _of_length_one(os.fspath(bvec), directions, used & (b > threshold))
     signal = nifti.voxels(name, image)[..., used]
-    inside, found = _inside(name, mask, signal, b[used] <= threshold, affine)
-    table = gradients.gradient_table(b[used], bvecs=directions[used], b0_threshold=threshold)
-    fit = dti.TensorModel(table).fit(signal, mask=inside)
-    fitted = Matrices(np.where(inside[..., None, None], fit.quadratic_form, 0.0), "fit", None)
+    inside, found = _inside(name, mask, signal, design, b, images, _UNKNOWNS + (noise == "residuals"), affine)
+    data = signal[inside].astype(np.float64)
+    tensors, pieces = np.zeros((*inside.shape, 3, 3)), []
+    for start in range(0, len(data), _AT_ONCE):
+        fit = _least_squares(data[start : start + _AT_ONCE], design)
+        pieces.append(fit.unknowns[:, :6] / largest)
+    tensors[inside] = unpack(np.concatenate(pieces), "nifti")
     covariance = modes = None
     if noise is not None:
-        covariance, modes = _covariance(signal, inside, dti.design_matrix(table), noise, bvec_frame, affine)
-    clipped = int((inside & (fit.evals[..., -1] < 1e-8)).sum())
+        covariance, modes = _covariance(data, inside, design, largest, noise, bvec_frame, affine)
     notes = [
-        f"weighted least-squares fit to {int(used.sum())} of {b.size} images (b ≤ {b[used].max():g} s/mm²)",
+        f"weighted least-squares fit to {b.size} of {all_images} images ({_shells(b)} s/mm²)",
         *remarks,
         *found,
         *nifti.placement_notes(image),
@@ -145,13 +177,75 @@ def fit_dwi(
     if bvec_frame != "fsl":
         notes.append(f"gradient directions read along the {bvec_frame} axes; tensors transformed to the voxel axes")
     if noise is not None:
-        left = f"the fit's residuals, with {int(used.sum()) - 7} degrees of freedom in each voxel"
+        left = f"the fit's residuals, with {b.size - _UNKNOWNS} degrees of freedom in each voxel"
         known = left if noise == "residuals" else f"the stated noise of the images, {noise:g}"
         notes.append(f"covariances of the tensors computed from {known}")
-    if clipped:
-        notes.append(f"{clipped} of {int(inside.sum())} fits are not positive definite; DIPY clips their eigenvalues")
+    fitted = Matrices(tensors, "fit", None)
     volume = placed(name, fitted, bvec_frame, affine, mask=inside, unit=MM2_PER_S, covariance=covariance, modes=modes)
+    _warn_of_large_b(largest, volume)
     return replace(volume, notes=tuple(notes), digest=digest(name))
+
+
+def _warn_of_large_b(largest: float, volume: TensorVolume) -> None:
+    """Warn of b-values at which the signal of tissue is not that of a tensor; slow diffusion allows larger b-values."""
+    mean = median_mean_diffusivity(volume)
+    if largest > _TENSOR_MODEL and largest * mean > 1:
+        warn_of_accuracy(
+            f"tensors are fitted to images up to b = {largest:g} s/mm², but a tensor describes the signal of tissue "
+            f"only for b ≲ {_TENSOR_MODEL:g} s/mm²; at larger b-values, diffusivities are underestimated. If the scan "
+            f"has images at lower b-values, pass b_max={_TENSOR_MODEL:g}"
+        )
+
+
+def _shells(b: Float[np.ndarray, " n"]) -> str:
+    """Return the numbers of images by b-value, such as "2 at b = 0, 30 at b = 995 … 1005", or the range of b-values."""
+    b = np.sort(b)
+    shells = np.split(b, np.flatnonzero(np.diff(b) > np.maximum(20.0, 0.05 * b[:-1])) + 1)
+    if len(shells) > 6:
+        return f"b = {b[0]:g} … {b[-1]:g}"
+    return ", ".join(f"{s.size} at b = {s[0]:g}" + f" … {s[-1]:g}" * bool(s[0] < s[-1]) for s in shells)
+
+
+def _design(b: Float[np.ndarray, " n"], directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 7"]:
+    """Return the matrix from the tensor's components xx xy yy xz yz zz and the log unweighted signal to log signals."""
+    rows, columns = np.transpose(indices("nifti", 3))
+    double = np.where(rows == columns, 1, 2)  # an off-diagonal component counts twice
+    weighted = -b[:, None] * directions[:, rows] * directions[:, columns] * double
+    return np.column_stack([weighted, np.ones(b.size)])
+
+
+def _rank(matrix: Float[np.ndarray, "n m"]) -> int:
+    return int((np.linalg.svd(matrix, compute_uv=False) > _DETERMINED).sum())
+
+
+def _require_determined(
+    table: str,
+    design: Float[np.ndarray, "n 7"],
+    b: Float[np.ndarray, " n"],
+    directions: Float[np.ndarray, "n 3"],
+    b_max: float | None,
+) -> None:
+    """Raise ValueError unless the images determine a tensor and the unweighted signal."""
+    rank = _rank(design)
+    if rank == _UNKNOWNS:
+        return
+    of_directions = _rank(_design(np.ones(b.size), directions)[:, :6])
+    if of_directions < 6:
+        missing = (
+            f"The gradient directions determine {of_directions} of a tensor's 6 components; expected at least six axes "
+            "that lie neither in a plane nor on a cone, where opposite directions are the same axis"
+        )
+    else:
+        missing = (
+            f"The b-values {b.min():g} to {b.max():g} s/mm² do not separate the mean diffusivity from the unweighted "
+            "signal; expected images of another b-value too, such as b = 0"
+        )
+    where = table if b_max is None else f"b_max: got {b_max:g}"
+    raised = ". Raise the limit, if the scan has such images" * (b_max is not None)
+    raise ValueError(
+        f"{where}: the {b.size} images ({_shells(b)} s/mm²) determine only {rank} of the {_UNKNOWNS} unknowns, the "
+        f"tensor's 6 components and the unweighted signal. {missing}{raised}"
+    )
 
 
 # In a voxel, let y be the log signals, X the design matrix, β the vector of unknowns, and W the diagonal matrix of the
@@ -163,11 +257,43 @@ def fit_dwi(
 # the image's row of the design matrix X, and w is its predicted signal. The residual r has the variance σ²(1 − h),
 # where h = w²xᵀ(XᵀW²X)⁻¹x is the leverage of the image. So the scaled residual r/√(1 − h) has the variance σ² of the
 # noise (MacKinnon and White 1985, HC2). A sample of the noise has one random factor for each image, which preserves
-# correlations between voxels.
+# correlations between voxels. A signal that was not measured has the weight w = 0 in all these formulas.
+class _Fit(NamedTuple):
+    """The weighted least-squares fits of voxels: β, W² and (XᵀW²X)⁻¹."""
+
+    unknowns: Float[np.ndarray, "v 7"]
+    weights: Float[np.ndarray, "v n"]
+    inverse: Float[np.ndarray, "v 7 7"]
+
+
+def _measured(signal: Float[np.ndarray, "*v n"]) -> Bool[np.ndarray, "*v n"]:
+    return np.isfinite(signal) & (signal > 0)
+
+
+def _information(weights: Float[np.ndarray, "v n"], design: Float[np.ndarray, "n 7"]) -> Float[np.ndarray, "v 7 7"]:
+    squares = design[:, :, None] * design[:, None, :]
+    return np.tensordot(weights, squares, axes=1)
+
+
+def _least_squares(data: Float[np.ndarray, "v n"], design: Float[np.ndarray, "n 7"]) -> _Fit:
+    measured = _measured(data)
+    y = np.log(np.where(measured, data, 1.0))
+
+    def solve(weights: Float[np.ndarray, "v n"]) -> Float[np.ndarray, "v 7"]:
+        return np.linalg.solve(_information(weights, design), ((weights * y) @ design)[..., None])[..., 0]
+
+    exponent = 2 * solve(measured.astype(np.float64)) @ design.T
+    largest = np.where(measured, exponent, -np.inf).max(axis=1, keepdims=True)
+    relative = np.where(measured, np.exp(np.clip(exponent - largest, np.log(_FAINT), 0.0)), 0.0)
+    scale = np.exp(largest)
+    return _Fit(solve(relative), relative * scale, np.linalg.inv(_information(relative, design)) / scale[..., None])
+
+
 def _covariance(
-    signal: Float[np.ndarray, "nx ny nz n"],
+    data: Float[np.ndarray, "v n"],
     inside: Bool[np.ndarray, "nx ny nz"],
     design: Float[np.ndarray, "n 7"],
+    largest: float,
     noise: float | Literal["residuals"],
     frame: str,
     affine: Float[np.ndarray, "4 4"],
@@ -176,24 +302,11 @@ def _covariance(
 
     If `noise` is ``"residuals"``, also return the contribution of each image to the components' noise; otherwise None.
     """
-    data = np.asarray(signal[inside], np.float64)
-    positive = data[data > 0]
-    y = np.log(np.maximum(data, positive.min() if positive.size else 1.0))
-    weights = np.exp(2 * y @ (design @ np.linalg.pinv(design)))
-    information = np.einsum("vn,na,nb->vab", weights, design, design, optimize=True)
-    inverse = np.linalg.inv(information)
+    measured, (unknowns, weights, inverse) = _measured(data), _least_squares(data, design)
     if noise == "residuals":
-        freedom = design.shape[0] - design.shape[1]
-        if freedom < 1:
-            raise ValueError(
-                f'noise: got "residuals" with {design.shape[0]} images, but a tensor and the unweighted signal are '
-                f"{design.shape[1]} unknowns; expected at least {design.shape[1] + 1} images, and 15 for an estimate "
-                "with an error of 25 %. Give the standard deviation of the noise as a number"
-            )
         # Residuals of the signals are used, because logarithms of small signals have large errors.
-        fitted = np.exp(np.einsum("na,vab,vb->vn", design, inverse, (weights * y) @ design, optimize=True))
-        left = data - fitted
-        variance = np.sum(left**2, axis=1) / freedom
+        left = np.where(measured, data - np.exp(unknowns @ design.T), 0.0)
+        variance = np.sum(left**2, axis=1) / (measured.sum(axis=1) - _UNKNOWNS)
         if (zero := variance <= 1e-20 * weights.mean(axis=1)).any():
             raise ValueError(
                 f'noise: got "residuals", which are zero in {int(zero.sum())} of {len(zero)} voxels; expected images '
@@ -202,7 +315,7 @@ def _covariance(
     else:
         require_number("noise", noise)
         variance = np.full(len(data), float(noise) ** 2)
-    turned = pack(to_voxel_axes(unpack(np.eye(6), "nifti"), frame, affine), "nifti").T
+    turned = pack(to_voxel_axes(unpack(np.eye(6), "nifti"), frame, affine), "nifti").T / largest
     covariance = np.zeros((*inside.shape, 6, 6))
     covariance[inside] = turned @ (variance[:, None, None] * inverse[:, :6, :6]) @ turned.T
     if noise != "residuals":
@@ -218,41 +331,55 @@ def _covariance(
     return covariance, modes
 
 
-def _of_length_one(
-    name: str, directions: Float[np.ndarray, "n 3"], weighted: Bool[np.ndarray, " n"]
-) -> tuple[Float[np.ndarray, "n 3"], list[str]]:
-    """Return unit directions for weighted images and zero for other images, and a note about lengths other than 1."""
+def _directed(
+    name: str, b: Float[np.ndarray, " n"], directions: Float[np.ndarray, "n 3"], images: Int[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"], list[str]]:
+    """Return b-values and unit directions, zero for images without a direction, and notes about changed directions."""
     lengths = np.linalg.norm(directions, axis=1)
-    bad = weighted & ~(np.abs(lengths - 1) <= _LENGTH)
+    directed = np.abs(lengths - 1) <= _LENGTH
+    bad = ~directed & (b > _UNWEIGHTED * b.max())
     if bad.any():
         first = int(np.argmax(bad))
         raise ValueError(
             f"{name}: got {int(bad.sum())} directions of weighted images without length 1, the first for image "
-            f"{first} (from 0), {directions[first].tolist()}, of length {lengths[first]:.4g}; expected length 1. "
-            "Divide each direction by its length. If the length encodes the gradient's strength, also multiply the "
-            "b-value by its square. Leave out images of unknown direction"
+            f"{images[first]} (from 0, b = {b[first]:g}), {directions[first].tolist()}, of length {lengths[first]:.4g};"
+            " expected length 1. Divide each direction by its length. If the length encodes the gradient's strength, "
+            "also multiply the b-value by its square. Leave out images of unknown direction"
         )
-    rounded = weighted & (np.abs(lengths - 1) > 1e-3)
-    unit = np.where(weighted[:, None], directions / np.where(weighted, lengths, 1.0)[:, None], 0.0)
-    if not rounded.any():
-        return unit, []
-    low, high = lengths[rounded].min(), lengths[rounded].max()
-    return unit, [f"{int(rounded.sum())} directions were divided by their lengths, {low:.4g} to {high:.4g}"]
+    notes = []
+    if (vague := ~directed & (b > 0)).any():
+        limit = b[vague].max()
+        notes.append(
+            f"{int(vague.sum())} images without a direction, b ≤ {limit:g}, count as unweighted, which changes "
+            f"diffusivities by up to {limit / b.max():.1%}"
+        )
+    rounded = directed & (b > 0) & (np.abs(lengths - 1) > 1e-3)
+    if rounded.any():
+        low, high = lengths[rounded].min(), lengths[rounded].max()
+        notes.append(f"{int(rounded.sum())} directions were divided by their lengths, {low:.4g} to {high:.4g}")
+    unit = np.where(directed[:, None], directions / np.where(directed, lengths, 1.0)[:, None], 0.0)
+    return np.where(directed, b, 0.0), unit, notes
 
 
 def _inside(
     name: str,
     mask: str | os.PathLike[str] | np.ndarray | None,
     signal: Float[np.ndarray, "nx ny nz n"],
-    unweighted: Bool[np.ndarray, " n"],
+    design: Float[np.ndarray, "n 7"],
+    b: Float[np.ndarray, " n"],
+    images: Int[np.ndarray, " n"],
+    needed: int,
     affine: Float[np.ndarray, "4 4"],
 ) -> tuple[Bool[np.ndarray, "nx ny nz"], list[str]]:
-    """Return the given or computed mask without voxels whose signal is not finite, and notes about the mask."""
-    notes, finite = [], np.isfinite(signal)
+    """Return the given or computed mask without voxels whose signals do not determine a tensor, and notes about it.
+
+    The numbers of the images in the file are `images`, and a voxel needs at least `needed` measured signals.
+    """
+    notes, measured = [], _measured(signal)
     if mask is None:
         # Resampling can produce NaN outside the brain; here NaN is replaced by zero signal.
         with np.errstate(invalid="ignore"):  # median_otsu divides by zero if its median filter returns zeros
-            mean = np.where(finite, signal, 0.0)[..., unweighted].mean(axis=-1)
+            mean = np.where(measured, signal, 0.0)[..., b <= max(_FOR_MASK, b.min())].mean(axis=-1)
             _, brain = optional("dipy.segment.mask").median_otsu(mean)
         if not brain.any():
             raise ValueError("mask: DIPY's median_otsu finds no brain in the unweighted images. Pass a mask")
@@ -260,13 +387,39 @@ def _inside(
         notes.append(f"no mask given: DIPY's median_otsu finds {int(inside.sum())} voxels in the unweighted images")
     else:
         inside = mask_on(signal.shape[:3], affine, mask)
-    usable = inside & finite.all(axis=-1)
-    if inside.any() and not usable.any():
-        whole = [str(n) for n in np.flatnonzero(~finite[inside].any(axis=0))]
-        which = f"the used images {', '.join(whole)} (from 0) have" if whole else "in each voxel, some image has"
-        raise ValueError(f"{name}: {which} no finite signal inside the mask; expected numbers. Leave such images out")
-    if lost := int((inside & ~usable).sum()):
-        notes.append(f"{lost} of {int(inside.sum())} voxels inside are left out: a signal there is NaN or infinite")
+    present = measured[inside]
+    if empty := images[~present.any(axis=0)].tolist():
+        raise ValueError(
+            f"{name}: the used images {', '.join(map(str, empty))} (from 0) have no positive finite signal inside the "
+            "mask; expected positive numbers. Leave such images out"
+        )
+    determined = present.sum(axis=1) >= needed
+    partial = np.flatnonzero(determined & ~present.all(axis=1))
+    information = _information(present[partial].astype(np.float64), design)
+    determined[partial] = np.linalg.eigvalsh(information)[:, 0] > _DETERMINED**2
+    usable = inside.copy()
+    usable[inside] = determined
+    if not determined.any():
+        raise ValueError(
+            f"{name}: in none of the {len(present)} voxels inside the mask, the positive finite signals determine a "
+            f"tensor, which needs {needed} images. Check the mask, and leave out images without signal"
+        )
+    if lost := int((~determined).sum()):
+        first = tuple(np.argwhere(inside & ~usable)[0].tolist())
+        notes.append(
+            f"{lost} of {len(present)} voxels inside are left out, the first at {first}: too few of their signals are "
+            "positive and finite to determine a tensor"
+        )
+    absent = ~present[determined]
+    if absent.any():
+        by_image = absent.sum(axis=0)
+        worst = int(np.argmax(by_image))
+        first = tuple(np.argwhere(usable)[np.argmax(absent.any(axis=1))].tolist())
+        notes.append(
+            f"{int(absent.sum())} signals in {int(absent.any(axis=1).sum())} other voxels, the first at {first}, are "
+            f"not positive and finite and have no weight; {int((by_image > 0).sum())} images have such signals, image "
+            f"{images[worst]} (from 0) most, {int(by_image[worst])}"
+        )
     return usable, notes
 
 

@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +24,8 @@ from hks_jax.io.volume import TensorVolume, describe, digest
 from hks_jax.io.vtk_image import by_time
 from hks_jax.storage import write_npz
 
+_NAME = re.compile(r"[A-Za-z0-9_.-]+")
+"""The names of arrays that all formats can hold: PLY has no spaces, Gmsh no quotation marks, VTU no "<"."""
 _PLACE = ("spacing", "origin", "mask", "affine", "slice_axis", "length_unit", "unit", "vertices", "faces", "cells")
 
 
@@ -142,12 +145,12 @@ def save(
         path: the file; missing folders are created.
         values: (*shape,) or (n_times, *shape); for a mesh (V,) or (n_times, V).
         volume: the volume, slice or mesh of the values.
-        name: the name of the values in the file.
+        name: the name of the values in the file, of letters a–z, digits, "_", "-" and ".".
         extra: more arrays, such as the times; NIfTI allows only the times.
         provenance: more entries of the record, such as the settings of the computation.
 
     Raises:
-        ValueError: the suffix is unknown, or the values have another shape.
+        ValueError: the suffix is unknown, the values have another shape, or a name has other characters.
         ImportError: an optional library is missing; the message gives the command that installs it.
 
     Examples:
@@ -159,6 +162,9 @@ def save(
     if not isinstance(volume, TensorVolume | SimplicialMesh):
         raise TypeError(f"volume: got {type(volume).__name__}; expected a TensorVolume or a mesh")
     require_real("values", values)
+    for argument, given in (("name", name), *(("extra", key) for key in extra or ())):
+        if not _NAME.fullmatch(given):
+            raise ValueError(f'{argument}: got the name {given!r}; expected letters a–z, digits, "_", "-" and "."')
     if name in (*_PLACE, *(extra or ())):
         raise ValueError(f"name: got {name!r}, which is the name of another array in the file; choose another name")
     file, array = Path(path), np.asarray(values)

@@ -70,7 +70,7 @@ def load_pairs(path: str | os.PathLike[str], pencil: AnyPencil) -> Eigenpairs:
 def pairs_of(name: str, arrays: Mapping[str, np.ndarray], pencil: AnyPencil) -> Eigenpairs:
     """Return the eigenpairs in the arrays of the file `name`; see `load_pairs`."""
     doubled = len(pencil.parts) > 1
-    names = [key for key in ARRAYS if key != "part" or doubled]
+    names = [key for key in ARRAYS if (key != "part" or doubled) and (key != "rounding" or key in arrays)]
     missing = [key for key in (*names, "solver_name") if key not in arrays]
     if missing:
         raise ValueError(f"{name}: the file lacks {', '.join(missing)}; expected a file that save_pairs wrote")
@@ -87,6 +87,7 @@ def pairs_of(name: str, arrays: Mapping[str, np.ndarray], pencil: AnyPencil) -> 
     lowest = bool(values.pop("lowest"))
     solver_name = str(np.asarray(arrays["solver_name"]))
     values.setdefault("part", None)
+    values.setdefault("rounding", jnp.zeros_like(values["eigenvalues"]))  # older files lack it
     pairs = Eigenpairs(**values, lowest=lowest, frame=values["vectors"], pencil=pencil, solver_name=solver_name)
     gap = np.concatenate([_residuals(pairs, number) for number in range(len(pencil.parts))])
     ends = np.array([pairs.next_eigenvalue, *pairs.eigenvalues[-1:], pairs.spectral_origin])

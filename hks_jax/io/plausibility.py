@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from hks_jax.io.repair import singular_question
 from hks_jax.io.tensor_order import fsl_signs, nearest_rotation
 from hks_jax.io.units import length_question, unit_question
 from hks_jax.io.volume import AXES, TensorVolume
@@ -175,25 +176,26 @@ OPEN_FRAME = (
 
 
 def questions(volume: TensorVolume) -> tuple[str, ...]:
-    """Check tensors for a wrong frame or unit; return questions such as "Wrong unit?", each with a remedy.
+    """Check tensors for a wrong frame or unit, and nearly singular tensors; return questions, each with a remedy.
 
     Reflected or rotated tensors are still positive definite, but fibres of neighbouring voxels do not line up. The
     function therefore compares, for several frames, the mean angle between the principal directions at a voxel and at
     its neighbours along the fibre. The comparison needs about 1000 anisotropic voxels inside the mask; set it first.
 
     If lengths are in mm, the function also checks that the size of the voxels is usual for scans, and that the median
-    mean diffusivity occurs in living tissue. For a slice, only the units are checked.
+    mean diffusivity occurs in living tissue. For a slice, the frame is not checked. Tensors are nearly singular if
+    `find_invalid` finds them although they are positive definite.
 
     Examples:
         >>> volume = hj.io.TensorVolume(np.array(field.tensors), (2.0, 2.0), (0.0, 0.0), length_unit="mm")
         >>> hj.io.questions(volume)[0][:11]  # 2.5 mm²/s is not of tissue
         'Wrong unit?'
     """
-    return reviewed(volume)[1]
+    return tuple(filter(None, (*reviewed(volume)[1], singular_question(volume))))
 
 
 def reviewed(volume: TensorVolume) -> tuple[TensorVolume, tuple[str, ...]]:
-    """Return the volume, with a note about its fibres but without the note `OPEN_FRAME`, and its `questions`."""
+    """Return the volume, with a note about its fibres but without the note `OPEN_FRAME`, and questions on its axes."""
     found = coherence(volume) if volume.length_unit == "mm" else None
     notes = [note for note in volume.notes if note != OPEN_FRAME]
     wrong_frame, settled = "", False

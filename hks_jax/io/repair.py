@@ -21,6 +21,7 @@ from hks_jax.domain.tensor_checks import (
     refuse,
     unsymmetric,
 )
+from hks_jax.io.units import is_plausible, median_mean_diffusivity
 from hks_jax.io.volume import TensorVolume
 
 Repair = Literal["clip", "mask", "nearest"]
@@ -36,8 +37,33 @@ _SAME, _TINY, _FILLED = 1e-6, 1e-6, 0.2
 """The relative tolerances for equal tensors and for zero tensors, and the share of voxels that a background exceeds."""
 
 
+_SINGULAR = 0.01
+"""The least eigenvalue of diffusion tensors, relative to the median mean diffusivity. No tissue has a smaller one, and
+no usual scan measures it, because it changes the signal by less than 1 %. Programs set it where a fit fails: DIPY
+raises negative eigenvalues to about 1e-9 mm²/s. In the metric D⁻¹ such voxels are extremely large, and their slow modes
+precede those of the tissue."""
+_NO_LIQUID = 1e-7
+"""The eigenvalue in mm²/s below which no diffusion tensor is admissible, whatever the median."""
+
+
+def least_admissible(volume: TensorVolume) -> float:
+    """Return the eigenvalue below which a tensor inside the mask of a volume counts as nearly singular.
+
+    For diffusion tensors, this eigenvalue is a hundredth of the median mean diffusivity, or 1e-7 mm²/s if that is more.
+    Tensors count as diffusion tensors if their unit is known, or if lengths are in mm and the median is that of living
+    tissue in mm²/s. For other tensors, and after a repair or a map to positive definite tensors, the result is zero.
+    """
+    median = median_mean_diffusivity(volume)
+    diffusion = volume.unit or (volume.length_unit == "mm" and is_plausible(median))
+    return max(_SINGULAR * median, _NO_LIQUID) if diffusion and not volume.repair else 0.0
+
+
 def find_invalid(volume: TensorVolume, floor: float | None = None) -> Bool[np.ndarray, "*shape"]:
     """Return the voxels inside the mask whose tensor is not finite or has an eigenvalue that is ≤ 0 or < `floor`.
+
+    If `floor` is None, diffusion tensors must not be nearly singular: their eigenvalues must be at least a hundredth
+    of the median mean diffusivity. Tensors are diffusion tensors if their unit is known (`TensorVolume.unit`), or if
+    lengths are in mm and the median is that of living tissue in mm²/s.
 
     Examples:
         >>> volume = hj.io.TensorVolume(np.array(field.tensors), (1.0, 1.0), (0.0, 0.0))
@@ -47,28 +73,57 @@ def find_invalid(volume: TensorVolume, floor: float | None = None) -> Bool[np.nd
     inside = volume.inside
     bad = np.zeros(volume.shape, bool)
     bad[inside] = ~spd.is_spd(volume.tensors[inside])
-    if floor is not None:
-        require_number("floor", floor, above=-math.inf)
+    floor = least_admissible(volume) if floor is None else floor
+    require_number("floor", floor, above=-math.inf)
+    if floor > 0:
         good = inside & ~bad
         bad[good] = np.linalg.eigvalsh(volume.tensors[good].astype(np.float64))[:, 0] < floor
     return bad
 
 
+def describe_invalid(volume: TensorVolume, bad: Bool[np.ndarray, "*shape"]) -> str:
+    """Return words about the tensors that `find_invalid` found, such as "not positive definite, …"."""
+    tensors = volume.tensors[bad]
+    finite, positive = np.isfinite(tensors).all(axis=(-2, -1)), spd.is_spd(tensors)
+    words, unit = "not positive definite", f" {volume.unit}" * bool(volume.unit)
+    small = f"with an eigenvalue below {least_admissible(volume):.3g}{unit}"
+    if positive.all():
+        words = f"nearly singular, {small}"
+    elif positive.any():
+        words += f" or ({int(positive.sum())} of them) nearly singular, {small}"
+    if finite.any():
+        words += f", worst eigenvalue {least_eigenvalue(tensors[finite]):.3g}"
+    return words + f", {int((~finite).sum())} of them NaN or infinite" * bool((~finite).any())
+
+
+def singular_question(volume: TensorVolume) -> str:
+    """Return a question if diffusion tensors are nearly singular (see `find_invalid`), or else the empty text."""
+    singular = find_invalid(volume) & ~find_invalid(volume, 0.0)
+    if not singular.any():
+        return ""
+    first = tuple(np.argwhere(singular)[0].tolist())
+    return (
+        f"Nearly singular? {int(singular.sum())} of {int(volume.inside.sum())} tensors are "
+        f"{describe_invalid(volume, singular)} (the first at voxel {first}). No tissue has such tensors; in the metric "
+        'D⁻¹ they are extremely large. Use repair_tensors(volume, "nearest")'
+    )
+
+
 def require_valid(volume: TensorVolume, argument: str = "repair") -> None:
-    """Raise ValueError with remedies if tensors inside the mask of a volume are not positive definite."""
+    """Raise ValueError with remedies if tensors inside the mask of a volume are invalid (see `find_invalid`)."""
     bad = find_invalid(volume)
     if bad.any():
         tensors = volume.tensors[bad]
-        finite, what = np.isfinite(tensors).all(axis=(-2, -1)), "not positive definite"
-        if finite.any():
-            what += f", worst eigenvalue {least_eigenvalue(tensors[finite]):.3g}"
-        if not finite.all():
-            what += f", {int((~finite).sum())} of them NaN or infinite"
         choices = ", ".join(f'"{name}" ({does})' for name, does in REPAIRS.items())
         remedy = f"Choose {argument}: {choices}"
+        if 2 * spd.is_spd(tensors).sum() > len(tensors):
+            remedy += (
+                ". No tissue has eigenvalues so small; programs set them where a fit fails or a voxel has no signal. "
+                "A smaller floor, such as clip:1e-12, keeps them"
+            )
         if bad.sum() > MANY * volume.inside.sum():
-            remedy = f"{_why_so_many(volume, tensors[finite])}. If only a few tensors are invalid, c{remedy[1:]}"
-        refuse("tensors", bad, volume.inside, "voxel", what, remedy)
+            remedy = f"{_why_so_many(volume, tensors)}. If only a few tensors are invalid, c{remedy[1:]}"
+        refuse("tensors", bad, volume.inside, "voxel", describe_invalid(volume, bad), remedy)
 
 
 def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = None) -> TensorVolume:
@@ -81,8 +136,9 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
             ``"clip"`` raises eigenvalues of an invalid tensor to the floor, which gives the nearest admissible tensor
             in the Frobenius norm. ``"mask"`` removes the voxels of invalid tensors from the mask. ``"nearest"``
             replaces an invalid tensor by the tensor of the nearest valid voxel in space.
-        floor: the least admissible eigenvalue, in the tensors' unit. If `floor` is None, all positive eigenvalues are
-            admissible, and the floor of ``"clip"`` is 1 % of the median of the valid tensors' mean eigenvalues.
+        floor: the least admissible eigenvalue, in the tensors' unit. If `floor` is None, `find_invalid` decides which
+            tensors are invalid, and the floor of ``"clip"`` is 1 % of the median of the valid tensors' mean
+            eigenvalues.
 
     Returns:
         The repaired volume, with a note that summarises the repair. The volume's attribute ``repair`` contains the
@@ -105,7 +161,8 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
     if floor is not None:
         require_number("floor", floor)
     volume = without_background(volume)
-    bad, inside = find_invalid(volume, floor), volume.inside
+    least = least_admissible(volume) if floor is None else floor
+    bad, inside = find_invalid(volume, least), volume.inside
     finite = bad & np.isfinite(volume.tensors).all(axis=(-2, -1))
     count, of, where = int(bad.sum()), int(inside.sum()), np.argwhere(bad)
     report: dict[str, Any] = {
@@ -120,9 +177,9 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
     }
     if not count:
         return replace(volume, repair=report)
-    wrong = "are not positive definite" if floor is None else f"have an eigenvalue below {floor:g}"
+    wrong = f"have an eigenvalue below {least:.3g}" if least else "are not positive definite"
     if count > MANY * of:
-        why = _why_so_many(volume, volume.tensors[finite], floor)
+        why = _why_so_many(volume, volume.tensors[bad], floor)
         if count == of:
             raise ValueError(f"repair: all {of} tensors {wrong}. {why}")
         warn_of_accuracy(
@@ -156,17 +213,21 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
             if (known := getattr(volume, name)) is not None:
                 changed[name] = known.copy()
                 changed[name][bad] = known[source]
+    worst += f", the first at voxel {tuple(report['first'][0])}"
     notes = (*volume.notes, f"repair: {count} of {of} tensors {wrong}{worst}; {done}")
     return replace(volume, tensors=tensors, **changed, repair=report, notes=notes)
 
 
-def _why_so_many(volume: TensorVolume, finite: Float[np.ndarray, "n d d"], floor: float | None = None) -> str:
-    """Return a possible reason for many invalid tensors, such as a wrong order; `finite` has the finite ones."""
+def _why_so_many(volume: TensorVolume, tensors: Float[np.ndarray, "n d d"], floor: float | None = None) -> str:
+    """Return a possible reason for many invalid tensors, such as a wrong order."""
+    finite = tensors[np.isfinite(tensors).all(axis=(-2, -1))]
     question = "" if volume.invalid_by_order is None else volume.invalid_by_order.question
     if floor is not None and not question:
         return "Choose a lower floor, or leave out voxels at the boundary of the mask"
     if question or not len(finite):
         return question or "Noise does not explain all invalid tensors. Programs often write NaN outside a mask"
+    if 2 * spd.is_spd(finite).sum() > len(finite):
+        return "Noise does not explain all invalid tensors. Programs often write tensors near zero outside a mask"
     largest = np.abs(np.linalg.eigvalsh(finite.astype(np.float64))).max()
     return (
         "Noise does not explain all invalid tensors. Tensors S of stress or strain are naturally indefinite, and need "
@@ -204,12 +265,14 @@ def find_background(volume: TensorVolume) -> tuple[Bool[np.ndarray, "*shape"], s
     tensors, d = volume.tensors, volume.dimension
     with np.errstate(invalid="ignore", over="ignore"):  # tensors may be NaN or infinite
         mean = np.trace(tensors, axis1=-2, axis2=-1, dtype=np.float64) / d
-        isotropic = mean > 0
+        isotropic, size = mean > 0, np.abs(mean)  # stresses may have the mean zero
         for i, j in product(range(d), repeat=2):  # a loop saves memory
             isotropic &= np.abs(tensors[..., i, j] - (mean if i == j else 0.0)) <= _SAME * mean
-    if not (mean > 0).any():
+            size = np.maximum(size, np.abs(tensors[..., i, j]))
+    usual = size[(size > 0) & np.isfinite(size)]
+    if not usual.size:
         return None
-    tiny = np.abs(mean) <= _TINY * np.quantile(mean[mean > 0], 0.99)
+    tiny = size <= _TINY * np.quantile(usual, 0.99)
     values, counts = np.unique(mean[isotropic].astype(np.float32), return_counts=True)
     filled = float(values[np.argmax(counts)]) if counts.size else np.nan
     same = isotropic & (np.abs(mean - filled) <= _SAME * filled)
@@ -240,7 +303,6 @@ def positive_tensors(volume: TensorVolume, how: PositiveMap, number: float) -> T
         >>> print(hj.io.positive_tensors(stress, "exp", 1.0).tensors[4, 4].diagonal().round(3))
         [2.718 0.368]
     """
-    volume = without_background(volume)
     inside, before = volume.inside, int(find_invalid(volume).sum())
     given = real_array("tensors", volume.tensors)
     mapped = np.asarray(positive_map("tensors", given, how, number, inside, "voxel"))

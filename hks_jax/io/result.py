@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from hks_jax import Grid, SurfaceMesh, TetMesh
 from hks_jax.arrays import describe_array
@@ -17,12 +17,14 @@ from hks_jax.checks import require_real
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.io.arrays import volume_of
 from hks_jax.io.files import save
-from hks_jax.io.units import median_mean_diffusivity
+from hks_jax.io.units import MEDIAN, median_mean_diffusivity, unit_of_times
 from hks_jax.io.volume import TensorVolume
-from hks_jax.signatures.times import RESOLVED
+from hks_jax.signatures.times import FREE, RESOLVED
 from hks_jax.storage import load_npz
 
 NAMES = ("hks", "curvature")
+KEPT = ("deviation", "bias", "z", "noise_maps", "scaled_times", "density", "input_tensors", "influence")
+"""The arrays of a file that a result keeps, beside its values, times and eigenvalues."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +37,10 @@ class Result:
         times: (n_times,), or (0,) for a result without times.
         eigenvalues: (k,), or (0,) if they are unknown.
         report: facts about the computation; the entry ``settings`` contains its settings.
-        arrays: more named arrays, saved with the result: ``deviation``, ``bias`` and ``noise_maps`` (n_draws, n_times,
-            *shape) for error bars, ``scaled_times`` (t times the first positive eigenvalue), and ``input_tensors``.
+        arrays: more named arrays, saved with the result: ``deviation``, ``bias``, ``z`` and ``noise_maps`` (n_draws,
+            n_times, *shape) for error bars, ``scaled_times`` (t times the first positive eigenvalue), ``density``
+            (√|D| of the diffusivity D, for Fick's operator), ``input_tensors``, and ``influence`` (n_times, *shape),
+            the influence of the boundary (`hks_jax.boundary_influence`).
         name: ``"hks"`` or ``"curvature"``.
         source: the file from which the result was read.
 
@@ -124,9 +128,7 @@ class Result:
             # Only a mesh with a mask may have vertices that belong to no cell, which are outside the domain.
             place = kind(arrays["vertices"], cells, mask=np.ones(cells.shape[:1], bool))
         eigenvalues, report = arrays.get("eigenvalues", np.zeros(0)), {"settings": record.get("settings") or {}}
-        more = {
-            n: a for n, a in arrays.items() if n in ("deviation", "bias", "noise_maps", "scaled_times", "input_tensors")
-        }
+        more = {n: a for n, a in arrays.items() if n in KEPT}
         return cls(place, values, times, eigenvalues, report, more, name, str(path))
 
     def save(self, stem: Path, image: str, origin: Mapping[str, Any] | None = None) -> None:
@@ -145,6 +147,9 @@ class Result:
         times = {"times": self.times} if self.times.size else {}
         extra = {**times, **({"eigenvalues": self.eigenvalues} if self.eigenvalues.size else {}), **self.arrays}
         record = {**(origin or {}), "settings": plain(self.settings), **times}
+        if self.times.size:
+            lengths = None if self.lengths is None else self.lengths.tolist()
+            record |= {"units": self.units, "lengths": lengths}
         for suffix in filter(None, (".npz", image)):
             given: dict[str, Any] = times if suffix.startswith(".nii") else extra
             if suffix == ".npz" and isinstance(self.place, TensorVolume):
@@ -187,28 +192,38 @@ class Result:
         return self.volume.tensors if known else None
 
     @property
-    def lengths(self) -> Float[np.ndarray, " n_times"] | None:
-        """(n_times,) the distances √(Dt), where D is the median mean diffusivity; None if the metric is not D⁻¹."""
-        if self.tensors is None or self.settings.get("metric") != "inverse":
+    def diffusivity(self) -> float | None:
+        """The D of √(Dt), the median of the tensors' mean eigenvalues in the domain; None if t is no time."""
+        if self.tensors is None or not self.in_time:
             return None
-        diffusivity = median_mean_diffusivity(self.volume.with_mask(np.isfinite(self.values[0])))
-        return np.sqrt(diffusivity * self.times) if diffusivity else None
+        return median_mean_diffusivity(self.volume.with_mask(np.isfinite(self.values[0]))) or None
+
+    @property
+    def lengths(self) -> Float[np.ndarray, " n_times"] | None:
+        """(n_times,) the distances √(Dt) for the `diffusivity` D; None if D is not known."""
+        return None if self.diffusivity is None else np.sqrt(self.diffusivity * self.times)
+
+    @property
+    def near_rim(self) -> Bool[np.ndarray, "n_times *shape"] | None:
+        """(n_times, *shape) the nodes at which the boundary contributes over a tenth; None if this is not known."""
+        influence = self.arrays.get("influence")
+        return None if influence is None else influence >= FREE
 
     @property
     def z(self) -> Float[np.ndarray, "n_times *shape"] | None:
-        """The values minus their flat-space value or their median, in standard deviations of the noise, if known."""
-        if "deviation" not in self.arrays:
-            return None
-        # Normalisations except "raw" and "flat" have no known value in flat space, so the median at each time is used.
-        flat = {"raw": 1 / self.flat_scale, "flat": 1.0}
-        median = np.nanmedian(self.values, axis=tuple(range(1, self.values.ndim)), keepdims=True)
-        return (self.values - flat.get(self.normalisation, median)) / self.arrays["deviation"]
+        """The distance of the values from those of constant tensors (`hks_jax.Uncertainty.z`), if known."""
+        return self.arrays.get("z")
 
     @property
     def smallest_time(self) -> float:
-        """The time below which more than 1 % of the signature lies beyond its eigenpairs; 0 if this is not known."""
-        spectral = self.eigenvalues.size and self.settings.get("method", "spectral") == "spectral"
-        return RESOLVED[self.dimension] / float(self.eigenvalues[-1]) if spectral else 0.0
+        """The time below which more than 1 % of the signature lies beyond its eigenpairs; 0 if this is not known.
+
+        It is infinite if no eigenvalue is positive.
+        """
+        if not self.eigenvalues.size or self.settings.get("method", "spectral") != "spectral":
+            return 0.0
+        last = float(self.eigenvalues[-1])
+        return RESOLVED[self.dimension] / last if last > 0 else math.inf
 
     @property
     def flat_scale(self) -> Float[np.ndarray, "n_times ..."]:
@@ -216,11 +231,31 @@ class Result:
         return (4 * np.pi * self.times.reshape(-1, *[1] * (self.values.ndim - 1))) ** (self.dimension / 2)
 
     @property
+    def to_flat(self) -> Float[np.ndarray, "n_times ..."]:
+        """The factor of the normalisation ``"flat"``, which is `flat_scale`, times √|D| for Fick's operator."""
+        return self.flat_scale * self.arrays.get("density", 1.0)
+
+    @property
+    def in_time(self) -> bool:
+        """Whether t is a time, as for the metric D⁻¹ and for Fick's operator."""
+        return self.settings.get("metric") == "inverse" or self.settings.get("operator") == "fick"
+
+    @property
     def unit(self) -> str:
-        """The unit of t: seconds for the metric D⁻¹ of tensors in mm²/s and lengths in mm; empty if it is not known."""
-        place = self.place
-        known = isinstance(place, TensorVolume) and place.unit and place.length_unit == "mm"
-        return "s" if known and self.settings.get("metric") == "inverse" else ""
+        """The unit of t (`hks_jax.io.units.unit_of_times`); empty if it is not known."""
+        if self.tensors is None or not isinstance(self.place, TensorVolume):
+            return ""
+        return unit_of_times(self.place, "inverse" if self.in_time else self.settings.get("metric"))
+
+    @property
+    def units(self) -> dict[str, Any]:
+        """Facts for reports: the units of t and of √(Dt), and the diffusivity D with its definition."""
+        return {
+            "t": self.unit or "(metric length)²",
+            "length": self.length_unit or None,
+            "D": self.diffusivity,
+            "D_is": None if self.diffusivity is None else MEDIAN,
+        }
 
     @property
     def length_unit(self) -> str:

@@ -33,14 +33,14 @@ def unpack(components: Float[np.ndarray, "*shape n"], order: str) -> Float[np.nd
     """Return symmetric 3×3 matrices from six components, or 2×2 matrices from three, in the given order."""
     d = 3 if components.shape[-1] == 6 else 2
     tensors = np.empty((*components.shape[:-1], d, d), components.dtype)
-    for c, (i, j) in enumerate(_indices(order, d)):
+    for c, (i, j) in enumerate(indices(order, d)):
         tensors[..., i, j] = tensors[..., j, i] = components[..., c]
     return tensors
 
 
 def pack(tensors: Float[np.ndarray, "*shape d d"], order: str) -> Float[np.ndarray, "*shape n"]:
     """Return the six components of symmetric 3×3 matrices, or the three of 2×2 matrices, in the given order."""
-    return np.stack([tensors[..., i, j] for i, j in _indices(order, tensors.shape[-1])], axis=-1)
+    return np.stack([tensors[..., i, j] for i, j in indices(order, tensors.shape[-1])], axis=-1)
 
 
 def to_voxel_axes(
@@ -78,7 +78,8 @@ def nearest_rotation(linear: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d
     return u @ vt
 
 
-def _indices(order: str, d: int) -> list[tuple[int, int]]:
+def indices(order: str, d: int) -> list[tuple[int, int]]:
+    """Return the row and the column of each component of a symmetric d × d matrix in the given order."""
     components = ORDERS["fsl" if order == "nrrd" else order]  # NRRD has FSL's order of components
     pairs = [("xyz".index(pair[0]), "xyz".index(pair[1])) for pair in components]
     return [pair for pair in pairs if max(pair) < d]

@@ -96,6 +96,24 @@ def median_mean_diffusivity(volume: TensorVolume) -> float:
     return float(np.median(means)) if means.size else 0.0
 
 
+MEDIAN = "the median of the mean eigenvalues of the tensors in the domain"
+"""The definition of D in the length √(Dt)."""
+
+
+def unit_of_times(volume: TensorVolume, metric: str | None) -> str:
+    """Return the unit of t, a squared length in the metric of tensors D; the empty text if it is not known.
+
+    Lengths must be in mm, and the tensors in mm²/s, as declared or as their plausible diffusivity suggests. For the
+    metric D⁻¹ the unit is s. For D it is mm⁴/s, and for |D|D⁻¹ it is mm⁴/s in 2D and mm⁶/s² in 3D.
+    """
+    known = volume.unit == MM2_PER_S or (not volume.unit and is_plausible(median_mean_diffusivity(volume)))
+    if volume.length_unit != "mm" or not known:
+        return ""
+    return {"inverse": "s", "tensor": "mm⁴/s", "adjugate": "mm⁴/s" if volume.dimension == 2 else "mm⁶/s²"}[
+        metric or "tensor"
+    ]
+
+
 def b_value_question(largest: float, unit: str) -> str:
     """Return a message if the largest b-value, in the reciprocal of `unit`, is implausible, or else the empty text."""
     (low, high), read = _B_VALUES, largest / UNITS[unit]

@@ -64,7 +64,7 @@ def chebyshev_iteration(
     −q(A)w, whose residual is p(A)w/p(ζ).
     """
     centre, half = (high + low) / 2, (high - low) / 2
-    s = (value - centre) / half
+    s = aligned((value - centre) / half, w)
 
     # On accelerators, each loop iteration takes two steps, so that new vectors overwrite old ones; with one step, XLA
     # would copy both vectors. If the number of steps is odd, an additional first step leads from z₀ = 0 to z₁.
@@ -85,7 +85,7 @@ def chebyshev_iteration(
         return state
 
     ratio = (1 - missing).astype(s.dtype) / s
-    first = jnp.zeros_like(w), aligned((ratio / half).astype(w.dtype), w) * w, ratio
+    first = jnp.zeros_like(w), (ratio / half).astype(w.dtype) * w, ratio
     return jax.lax.fori_loop(0, (degree - 1 + missing) // together, turn, first)[1]
 
 
@@ -99,7 +99,7 @@ def chebyshev_heat_coefficients(
     angles = (np.arange(samples) + 0.5) * (np.pi / samples)
     weights = np.cos(np.outer(angles, np.arange(degree + 1))) * (2 / samples)
     weights[:, 0] /= 2
-    values = jnp.exp(-times[:, None] * top * jnp.asarray((1 + np.cos(angles)) / 2, times.dtype))
+    values = jnp.exp(-times[:, None] * top * jnp.asarray((1 + np.cos(angles)) / 2, times.dtype)[None])
     return matmul(values, jnp.asarray(weights, times.dtype))
 
 

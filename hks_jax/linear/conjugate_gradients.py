@@ -121,9 +121,12 @@ def conjugate_gradients(
             state, regular = advance(before)
             # The preconditioned residual gives the error before this step. The step is assumed to reduce the error by
             # the same factor as the previous step; this saves one expensive application of the preconditioner.
-            reduction = xp.where(before.fresh, 1, xp.sqrt(xp.minimum(xp.abs(before.change), 1)))
+            skipped = before.fresh | ~regular
+            reduction = xp.where(skipped, 1, xp.sqrt(xp.minimum(xp.abs(before.change), 1)))
             error = relative(before.energy, before.first) * reduction
-        errors = xp.where(before.going, xp.where(regular, error, xp.inf), before.errors)
+        # If symmetry exhausts the Krylov space, the residual is pure rounding, and rᵀz may be negative. The iteration
+        # then stops, like that of a singular matrix, but |rᵀz| shows that the solution is accurate.
+        errors = xp.where(before.going, error, before.errors)
         going = before.going & (regular | state.fresh) & (errors > 1)
         # On the host, the preconditioner skips zero columns.
         return state._replace(r=xp.where(going, state.r, 0), p=xp.where(going, state.p, 0), errors=errors, going=going)

@@ -51,7 +51,7 @@ def second_divided_difference(
         nodes, weights = (np.asarray(numbers) for numbers in gauss(n))
         s = jnp.asarray(np.repeat(nodes, n), low.dtype).reshape(-1, *(1,) * low.ndim)
         u = jnp.asarray(np.tile(nodes, n), low.dtype).reshape(s.shape)
-        values = curvature(low + s * (middle - low) + s * u * (high - middle))
+        values = curvature(low[None] + s * (middle - low)[None] + s * u * (high - middle)[None])
         weight = jnp.asarray(np.outer(weights * nodes, weights).ravel(), low.dtype)
         return jnp.tensordot(weight, values, 1, precision="highest")
 

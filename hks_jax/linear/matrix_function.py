@@ -145,7 +145,8 @@ def _second(f: Function, at: Any, one: Any, constants: Any, two: Any) -> Matrix:
 
 def _table(f: Callable[[Array], Array], values: Float[Array, " n"]) -> Matrix:
     """Return the matrix [f] of divided differences of all pairs of eigenvalues."""
-    return divided_difference(f, jnp.minimum(values[:, None], values), jnp.maximum(values[:, None], values))
+    a, b = values[:, None], values[None]
+    return divided_difference(f, jnp.minimum(a, b), jnp.maximum(a, b))
 
 
 def _table_along(f: Function, parameters: Any, others: Any, values: Float[Array, " n"], change: Any) -> Matrix:

@@ -4,6 +4,7 @@ from typing import TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hks_jax.linear.operators import Operator, PatternedOperator, SparseOperator, shifted
@@ -23,6 +24,20 @@ class NullSpace(eqx.Module):
     fixed: bool = eqx.field(default=False, static=True)
 
 
+class Unrounded(eqx.Module):
+    """A stiffness K − σM before its entries are rounded, for computations on the host; constant in derivatives.
+
+    Attributes:
+        stiffness: K.
+        origin: σ.
+        null_vectors: vectors (m, n_dof) that K annihilates except for rounding; m may be 0.
+    """
+
+    stiffness: PatternedOperator
+    origin: Float[Array, ""]
+    null_vectors: Float[Array, "m n_dof"]
+
+
 class SymmetricPencil(eqx.Module):
     """The stiffness K and mass M of Kφ = λMφ. The matrices K and M are symmetric, and M ≻ 0.
 
@@ -30,11 +45,13 @@ class SymmetricPencil(eqx.Module):
         stiffness: K; use ``@`` for products, ``.to_scipy()`` and ``.to_dense()`` for conversion.
         mass: M, an operator like K. The sparsity pattern of K contains the pattern of M.
         null_space: the null space of K ⪰ 0. None means that the null space is unknown and K may be indefinite.
+        source: what K was before rounding, if that is more than K; otherwise None.
     """
 
     stiffness: PatternedOperator
     mass: Operator
     null_space: NullSpace | None = eqx.field(default=None, kw_only=True)
+    source: Unrounded | None = eqx.field(default=None, kw_only=True)
 
     @property
     def size(self) -> int:
@@ -55,6 +72,21 @@ class SymmetricPencil(eqx.Module):
     def n_fixed(self) -> int:
         """The number of null vectors that every perturbation of K annihilates."""
         return self.n_null if self.null_space is not None and self.null_space.fixed else 0
+
+    @property
+    def unrounded(self) -> Unrounded:
+        """The stiffness before rounding, and its null vectors as far as they are known."""
+        if self.source is not None:
+            return self.source
+        dtype = self.stiffness.dtype
+        nulls = jnp.zeros((0, self.size), dtype) if self.null_space is None else self.null_space.vectors
+        return jax.lax.stop_gradient(Unrounded(self.stiffness, jnp.zeros((), dtype), nulls))
+
+    def moved_by(self, origin: Float[Array, ""]) -> tuple[PatternedOperator, Unrounded]:
+        """Return K − σM for an origin σ, rounded and unrounded."""
+        before, origin_only = self.unrounded, jax.lax.stop_gradient(origin)
+        moved = self.stiffness.with_flat(self.shifted(origin))
+        return moved, Unrounded(before.stiffness, before.origin + origin_only, before.null_vectors)
 
     def shifted(self, shift: Float[Array, ""]) -> Float[Array, " m"]:
         """Return the entries of K − σM at the places of K's pattern."""

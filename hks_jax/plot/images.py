@@ -1,22 +1,33 @@
 """Images of scalars on grids."""
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Real
+from jaxtyping import Bool, Real
 from matplotlib.axes import Axes
 from matplotlib.colors import Colormap
 from matplotlib.image import AxesImage
 
 from hks_jax.checks import require_number, require_real
+from hks_jax.domain.components import as_mask
 from hks_jax.domain.grid import Grid
 from hks_jax.plot.figure import cell_extent, colour_bar, frame, require_plane
 from hks_jax.plot.orientation import Orientation
 
+HATCH = "0.25"
+"""The colour of hatching."""
 FADED = 2.0
-"""The number of standard deviations from the null value above which values are not faded as noise."""
+"""The distance |z| from the null value above which values are not faded as noise."""
+UNFADED = math.erfc(FADED / math.sqrt(2))
+"""The share of nodes that noise alone leaves without any grey."""
+FADED_NOTE = (
+    "grey: noise explains the difference from constant tensors;\n"
+    f"noise alone leaves {100 * UNFADED:.0f} % of the nodes without grey"
+)
+"""The legend of pictures with faded values."""
 FAR = 1.5
 """If the median of nonnegative values exceeds 1.5 times the centre, the colour range is not centred."""
 RULES = ("quantiles", "least_range", "centre", "vmin", "vmax")
@@ -38,6 +49,7 @@ def scalar_image(
     label: str = "",
     orientation: Orientation | None = None,
     z: Real[ArrayLike, "nx ny"] | None = None,
+    hatched: Bool[ArrayLike, "nx ny"] | None = None,
     **kwargs: Any,
 ) -> AxesImage:
     """Draw nodal values as an image with array axis 0 horizontal and one cell per node, transparent outside the mask.
@@ -59,8 +71,9 @@ def scalar_image(
         colorbar: whether to add a colour bar.
         label: the colour bar's label.
         orientation: the grid's orientation in space, by which the image is turned and its sides are labelled (L, R, …).
-        z: (*shape,) the distance of the values from a null value in standard deviations of noise
-            (`hks_jax.Uncertainty.z`). Values within two standard deviations of the null value fade to grey.
+        z: (*shape,) the distance of the values from a null value as a normal number (`hks_jax.Uncertainty.z`). Values
+            with |z| < 2 fade to grey; noise alone leaves 4.6 % of the nodes without grey.
+        hatched: (*shape,) the nodes that are hatched, such as those where `hks_jax.boundary_influence` exceeds 0.1.
         **kwargs: arguments of `Axes.imshow`.
 
     Raises:
@@ -73,10 +86,12 @@ def scalar_image(
     """
     require_plane("grid", grid)
     array = masked("values", values, grid)
+    lines = None if hatched is None else as_mask("hatched", hatched) & ~np.ma.getmaskarray(array)
     opacity = None if z is None else (1 - np.abs(masked("z", z, grid)) / FADED).clip(0, 1).filled(0)
     if orientation is not None:
         array = orientation.array(array)
         opacity = None if opacity is None else orientation.array(opacity)
+        lines = None if lines is None else orientation.array(lines)
         grid = orientation.grid(grid)
     ((low, high, own),) = colours_of([array.compressed()], quantiles, least_range, centre, vmin, vmax)
     image = ax.imshow(
@@ -91,12 +106,21 @@ def scalar_image(
     if opacity is not None:
         grey = np.dstack([np.full((*opacity.T.shape, 3), 0.8), opacity.T])
         ax.imshow(grey, origin="lower", extent=cell_extent(grid), interpolation="nearest")
+    if lines is not None and lines.any():
+        _hatch(ax, lines, grid)
     frame(ax, grid)
     if orientation is not None:
         orientation.letter(ax)
     if colorbar:
         colour_bar(ax, image, label)
     return image
+
+
+def _hatch(ax: Axes, nodes: Bool[np.ndarray, "nx ny"], grid: Grid) -> None:
+    """Hatch the cells of nodes; a margin of cells that are not hatched closes the outline half a cell beyond them."""
+    axes = [np.concatenate([[a[0] - h], a, [a[-1] + h]]) for a, h in zip(grid.axes, grid.spacing, strict=True)]
+    area = ax.contourf(*axes, np.pad(nodes, 1).T.astype(float), levels=[0.5, 2.0], colors="none", hatches=["////"])
+    area.set(edgecolor=HATCH, linewidth=0.0)
 
 
 def influence_map(
@@ -178,7 +202,7 @@ def colours_of(
         low, high = (float(q) for q in np.quantile(values, quantiles))
         if centre is not None:
             reach = max(high - centre, centre - low)
-            if values.min() >= 0 < centre and np.median(values) <= FAR * centre:
+            if values.min() >= 0 < centre:
                 reach = min(reach, centre)  # no colours for negative values
             low, high = centre - reach, centre + reach
         lacking = least_range * (max(abs(low), abs(high)) or 1.0) - (high - low)

@@ -109,7 +109,7 @@ class Orientation(NamedTuple):
 
     def field(self, field: TensorField) -> TensorField:
         """Return a tensor field in the order of the image, with components along its axes."""
-        return TensorField(self.grid(field.grid), self.tensors(field.tensors), field.interpolation)
+        return field.with_tensors(self.tensors(field.tensors), self.grid(field.grid))
 
     def node(self, node: Sequence[int], shape: Sequence[int]) -> tuple[int, ...]:
         """Return a node's indices in the image from its indices in an array of the given shape."""

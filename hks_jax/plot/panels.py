@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Float, Real
+from jaxtyping import Bool, Float, Real
 from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 
@@ -32,6 +32,7 @@ def hks_panels(
     suptitle: str = "",
     orientation: Orientation | None = None,
     z: Real[ArrayLike, "n_times nx ny"] | None = None,
+    hatched: Bool[ArrayLike, "n_times nx ny"] | None = None,
     **kwargs: Any,
 ) -> Figure:
     """Return a figure with one image of the HKS per time, each with separate colours unless `shared_range` is set.
@@ -48,6 +49,7 @@ def hks_panels(
         suptitle: the figure's title.
         orientation: the same as for `scalar_image`.
         z: (n_times, *shape); values within the noise fade as in `scalar_image`.
+        hatched: (n_times, *shape) the nodes that are hatched.
         **kwargs: arguments of `scalar_image` for all images, such as cmap, vmin, vmax, centre, quantiles, least_range
             and label.
 
@@ -60,7 +62,7 @@ def hks_panels(
         ['$t$ = 0.2', '$t$ = 0.5']
     """
     require_plane("grid", grid)
-    t = checked_times(times, grid.shape, values=values, z=z)
+    t = checked_times(times, grid.shape, values=values, z=z, hatched=hatched)
     titles = panel_titles(t, titles, unit)
     images = [masked("values", v, grid) for v in np.ma.asarray(values)]
     colours = panel_colours(images, limits, shared_range, **kwargs)
@@ -68,12 +70,13 @@ def hks_panels(
     columns = math.ceil(t.size / rows)
     width, height = panel_size(grid if orientation is None else orientation.grid(grid), 2.6, 5.0)
     fig = new_figure(columns * (width + 1.0) + 0.4, rows * (height + 0.45) + 0.3 + 0.3 * bool(suptitle))
-    noise = [None] * t.size if z is None else np.asarray(z)
+    noise, lines = ([None] * t.size if each is None else np.asarray(each) for each in (z, hatched))
     panels = fig.subplots(rows, columns, squeeze=False).ravel()
     for ax in panels[t.size :]:
         ax.remove()
     for index, ax in enumerate(panels[: t.size]):
-        scalar_image(ax, images[index], grid, orientation=orientation, z=noise[index], **colours[index])
+        masks: dict[str, Any] = {"z": noise[index], "hatched": lines[index]}
+        scalar_image(ax, images[index], grid, orientation=orientation, **masks, **colours[index])
         ax.set_title(titles[index], fontsize="medium")
         ax.tick_params(labelleft=index % columns == 0, labelbottom=index + columns >= t.size)
     return finished(fig, suptitle, path)

@@ -10,23 +10,28 @@ from matplotlib.figure import Figure
 from scipy import ndimage
 
 from hks_jax import Grid
-from hks_jax.fem.boundary import normalise_boundary
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result, require_result
-from hks_jax.plot.images import Colours, colours_of
+from hks_jax.io.units import MM2_PER_S
+from hks_jax.plot.figure import number_text
+from hks_jax.plot.images import FADED, FADED_NOTE, Colours, colours_of
 from hks_jax.plot.orientation import Orientation, View
 from hks_jax.plot.panels import hks_panels, panel_titles
 from hks_jax.plot.volumes import volume_panels
+from hks_jax.signatures.times import FREE
 
+ENOUGH = 0.1
+"""The share of free nodes above which the range of colours is that of the nodes free of the boundary."""
 SPAN = (0.002, 0.998)
 """The quantiles of the values away from the boundary that the first and last colours represent."""
 POWERS = {2: (r"4\pi t", "t^{-1}"), 3: (r"(4\pi t)^{3/2}", "t^{-3/2}")}
 """The factor of the normalisation "flat" and the unit of the signature, by dimension; t is a squared length."""
 METRICS = {"tensor": "D", "inverse": "D⁻¹", "adjugate": "|D|D⁻¹"}
+FICK = "Fick's, div(D∇u)"
 LEAST_RANGE = 0.01
 """The colour range is at least 1 % of the values, so that the contrast of nearly constant values is low."""
 RIM = 5
-"""Values within 5 nodes of the boundary do not affect the colour range, because the boundary raises the HKS."""
+"""If the boundary's influence is not known, values within 5 nodes of the boundary do not affect the colour range."""
 
 
 def signature_panels(
@@ -36,12 +41,15 @@ def signature_panels(
     title: str = "",
     view: View = "neurological",
     through: tuple[int, int, int] | None = None,
+    show_rim: bool = False,
 ) -> Figure:
     """Return a figure of a signature on a slice, or on three slices of a volume, with separate colours for each time.
 
     The colour range contains nearly all values away from the boundary, and colour bars have arrows if other values
     exceed the range. With "flat" normalisation the colours diverge from 1, the value for a flat metric, unless most
-    values are far above 1. Values that noise explains fade to grey. Titles contain diffusion lengths √(Dt), if known.
+    values are far above 1. Values that noise explains fade to grey, and titles contain the share of the nodes that are
+    not grey. Nodes at which the boundary contributes over a tenth of the signature are hatched, if `result.arrays` has
+    the influence. Titles contain diffusion lengths √(Dt), if known.
 
     Args:
         result: the signature to draw.
@@ -49,6 +57,7 @@ def signature_panels(
         title: the title, by default the normalisation and the metric.
         view: ``"neurological"`` (left is on the left) or ``"radiological"`` (left is on the right), for data in space.
         through: the voxel through which slices run, or the nearest voxel in the domain; by default a central voxel.
+        show_rim: whether nodes near the boundary are not hatched.
 
     Raises:
         ValueError: if the result is on a mesh.
@@ -63,9 +72,11 @@ def signature_panels(
     volume, inside = result.volume, np.isfinite(result.values[0])
     grid, box = cropped(volume, inside)
     colours = _colours(result, inside)
+    near = None if show_rim else result.near_rim
     style: dict[str, Any] = {
         "titles": titles_of(result),
-        "suptitle": title or caption(result),
+        "suptitle": "\n".join([title or caption(result), *legend(result, near)]),
+        "hatched": None if near is None else near[:, *box],
         "limits": [each[:2] for each in colours],
         "cmap": colours[0].cmap,
         "orientation": placed(volume, box, view),
@@ -89,27 +100,53 @@ def caption(result: Result) -> str:
         "flat": f"${factor}$·HKS, which is 1 for flat space",
     }
     metric = METRICS.get(result.settings.get("metric") or "")
+    if result.settings.get("operator") == "fick":
+        names["flat"] = rf"${factor}\sqrt{{|D|}}\,$HKS, which is 1 for constant D"
+        return f"{names[result.normalisation]}, Fick's operator"
     return names[result.normalisation] + f", metric {metric}" * (metric is not None)
 
 
-def titles_of(result: Result) -> Sequence[str]:
-    """Return a title for each time of a signature, with the length √(Dt) if it is known."""
+def legend(result: Result, near: Bool[np.ndarray, "n_times *shape"] | None) -> list[str]:
+    """Return the lines of a legend: the diffusivity D of √(Dt), and the meaning of grey and of the hatching."""
+    words = []
+    if result.diffusivity is not None:
+        unit = f" {MM2_PER_S}" * (result.unit == "s")
+        words.append(f"D = {number_text(result.diffusivity)}{unit}, the median mean diffusivity")
+    if near is not None and near.any():
+        words.append(f"hatched: the boundary contributes over {100 * FREE:.0f} %")
+    return words if result.z is None else [*words, FADED_NOTE]
+
+
+def titles_of(result: Result, unit: str | None = None) -> Sequence[str]:
+    """Return a title for each time, with √(Dt) and the share of nodes above the noise if they are known.
+
+    The text `unit` replaces the unit of t.
+    """
     early = [" (too few eigenpairs)" * bool(t < result.smallest_time) for t in result.times]
-    titles = [title + why for title, why in zip(panel_titles(result.times, None, result.unit), early, strict=True)]
-    if result.lengths is None:
-        return titles
-    lengths = (f"{length:.3g} {result.length_unit}".rstrip() for length in result.lengths)
-    return [f"{title}\n$\\sqrt{{Dt}}$ = {length}" for title, length in zip(titles, lengths, strict=True)]
+    names = panel_titles(result.times, None, unit or result.unit)
+    titles = [title + why for title, why in zip(names, early, strict=True)]
+    if result.lengths is not None:
+        lengths = (f"{length:.3g} {result.length_unit}".rstrip() for length in result.lengths)
+        titles = [f"{title}\n$\\sqrt{{Dt}}$ = {length}" for title, length in zip(titles, lengths, strict=True)]
+    if result.z is not None:
+        shares = (np.mean(np.abs(z[np.isfinite(z)]) > FADED) for z in result.z)
+        titles = [f"{title}\n{100 * share:.0f} % without grey" for title, share in zip(titles, shares, strict=True)]
+    return titles
 
 
 def _colours(result: Result, inside: Bool[np.ndarray, "*shape"]) -> list[Colours]:
     """Return the colours for each time, which span nearly all values away from the boundary."""
-    rim = normalise_boundary(result.settings.get("boundary", "neumann"), inside.ndim)[-1]
-    # The boundary condition "mean" removes the boundary's effect, except at corners and in thin parts of 3D masks.
-    deep = inside if "mean" in rim and inside.ndim == 2 else away_from_rim(inside)
-    span = (0.01, 0.99) if "mean" in rim else SPAN
     centre = 1.0 if result.normalisation == "flat" else None
-    return colours_of([values[deep] for values in result.values], span, LEAST_RANGE, centre)
+    chosen = nodes_for_colours(result, inside if result.near_rim is not None else away_from_rim(inside))
+    images = [values[nodes] for values, nodes in zip(result.values, chosen, strict=True)]
+    return colours_of(images, SPAN, LEAST_RANGE, centre)
+
+
+def nodes_for_colours(result: Result, nodes: Bool[np.ndarray, "*shape"]) -> list[Bool[np.ndarray, "*shape"]]:
+    """Return those of the nodes at each time that are free of the boundary; all nodes if these are few or not known."""
+    near = result.near_rim
+    free = [nodes if near is None else nodes & ~near[i] for i in range(len(result.values))]
+    return [one if one.sum() > ENOUGH * nodes.sum() else nodes for one in free]
 
 
 def cropped(volume: TensorVolume | Grid, inside: Bool[np.ndarray, "*shape"]) -> tuple[Grid, tuple[slice, ...]]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Real
+from jaxtyping import Bool, Real
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -16,7 +16,7 @@ from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from hks_jax.checks import require_real
-from hks_jax.domain.components import active_elements
+from hks_jax.domain.components import active_elements, as_mask
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.simplicial_mesh import SurfaceMesh, TetMesh
 from hks_jax.optional import optional
@@ -24,6 +24,8 @@ from hks_jax.plot.figure import inches
 from hks_jax.plot.images import colours_of, masked
 from hks_jax.plot.volumes import require_volume
 
+STRIPES = 30
+"""The largest number of dark stripes of hatched vertices along a side of a surface."""
 LIGHT = (0.3, -0.5, 0.8)
 """The direction towards the light."""
 
@@ -38,6 +40,7 @@ def surface(
     vmax: float | None = None,
     relief: float = 0.35,
     zoom: float = 1.25,
+    hatched: Bool[ArrayLike, " V"] | None = None,
     **kwargs: Any,
 ) -> ScalarMappable:
     """Draw a surface, or the boundary of a solid, coloured by vertex values; return the mappable for a colour bar.
@@ -53,6 +56,7 @@ def surface(
         vmax: the value of the last colour, by default the greatest value.
         relief: the strength of the shading between 0 and 1, where 0 means no shading.
         zoom: the size of the surface in its axes.
+        hatched: (V,) the vertices around which dark stripes are drawn, such as those near the boundary.
         **kwargs: arguments of `Poly3DCollection`.
 
     Raises:
@@ -72,9 +76,12 @@ def surface(
     scalars = np.asarray(values, dtype=np.float64)
     if scalars.shape != (len(mesh.vertices),):
         raise ValueError(f"values: got shape {scalars.shape}; expected ({len(mesh.vertices)},), one per vertex")
+    lines = np.zeros(scalars.shape, bool) if hatched is None else as_mask("hatched", hatched)
+    if lines.shape != scalars.shape:
+        raise ValueError(f"hatched: got shape {lines.shape}; expected {scalars.shape}, as for the values")
     if isinstance(mesh, TetMesh):
         mesh, numbers = mesh.boundary()
-        scalars = scalars[numbers]
+        scalars, lines = scalars[numbers], lines[numbers]
     vertices, used = np.asarray(mesh.vertices, dtype=np.float64), mesh.triangulation.used
     corners = vertices[mesh.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -87,6 +94,11 @@ def surface(
     mappable.autoscale_None()
     colours = mappable.to_rgba(scalars[mesh.faces].mean(axis=1))
     colours[:, :3] *= brightness[:, None]
+    # The stripes lie on the surface: across them runs a diagonal of space, along which two triangles make a period.
+    edge = np.median(np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1))
+    period = max(np.ptp(vertices[used], axis=0).max() / STRIPES, 4 * edge)
+    stripe = (corners.mean(axis=1) @ np.ones(3) / period) % 1 < 0.4
+    colours[stripe & (lines[mesh.faces].mean(axis=1) > 0.5), :3] *= 0.45
     # Edges with the faces' colours hide the gaps that antialiasing causes between triangles.
     ax.add_collection3d(
         Poly3DCollection(corners, facecolors=colours, edgecolors=colours, **{"linewidths": 0.2, **kwargs})

@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
+from hks_jax.domain.components import as_mask
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_checks import require_grid
 from hks_jax.plot.figure import SMALL, colour_bar_in, finished, new_figure
@@ -55,6 +56,7 @@ def orthogonal_slices(
     cross: bool = True,
     orientation: Orientation | None = None,
     z: Real[ArrayLike, "nx ny nz"] | None = None,
+    hatched: Bool[ArrayLike, "nx ny nz"] | None = None,
     **kwargs: Any,
 ) -> AxesImage:
     """Draw the slices xy, xz and yz of a volume through a node in the same colours, and return the last image.
@@ -68,6 +70,7 @@ def orthogonal_slices(
         cross: whether thin lines show the positions of the other two slices.
         orientation: the grid's orientation in space, by which slices are turned and their sides are labelled (L, R, …).
         z: (*shape,); values within the noise fade as in `scalar_image`.
+        hatched: (*shape,) the nodes that are hatched.
         **kwargs: arguments of `scalar_image` for the whole volume, such as cmap, vmin, vmax, centre, quantiles.
 
     Raises:
@@ -81,17 +84,22 @@ def orthogonal_slices(
     if len(axes) != 3:
         raise ValueError(f"axes: got {len(axes)} axes; expected 3, for the planes xy, xz and yz")
     require_volume(grid)
-    noise = None if z is None else masked("z", z, grid)
-    if noise is not None and orientation is not None:
-        noise = orientation.array(noise)
+    masks: dict[str, Any] = {
+        "z": None if z is None else masked("z", z, grid),
+        "hatched": None if hatched is None else as_mask("hatched", hatched),
+    }
+    if orientation is not None:
+        masks = {name: None if mask is None else orientation.array(mask) for name, mask in masks.items()}
     array, grid, chosen = _turned(masked("values", values, grid), grid, node, orientation)
     (style,) = panel_colours([array], **kwargs)
     for ax, (first, second) in zip(axes, PLANES, strict=True):
         normal = 3 - first - second
         plane = (np.take(of, (first, second)).tolist() for of in (grid.shape, grid.spacing, grid.origin))
         slab = np.take(array, chosen[normal], axis=normal)
-        faded = None if noise is None else np.take(noise, chosen[normal], axis=normal)
-        image = scalar_image(ax, slab, Grid(*plane), colorbar=False, z=faded, **style)
+        cut: dict[str, Any] = {
+            n: None if mask is None else mask.take(chosen[normal], axis=normal) for n, mask in masks.items()
+        }
+        image = scalar_image(ax, slab, Grid(*plane), colorbar=False, **cut, **style)
         if orientation is not None:
             orientation.letter(ax, (first, second))
         if cross:
@@ -116,6 +124,7 @@ def volume_panels(
     suptitle: str = "",
     orientation: Orientation | None = None,
     z: Real[ArrayLike, "n_times nx ny nz"] | None = None,
+    hatched: Bool[ArrayLike, "n_times nx ny nz"] | None = None,
     **kwargs: Any,
 ) -> Figure:
     """Return a figure with a column of three orthogonal slices of the HKS and a colour bar for each time.
@@ -134,6 +143,7 @@ def volume_panels(
         suptitle: the figure's title.
         orientation: the same as for `orthogonal_slices`.
         z: (n_times, *shape); values within the noise fade as in `hks_panels`.
+        hatched: (n_times, *shape) the nodes that are hatched.
         **kwargs: arguments of `scalar_image` for all volumes, such as cmap, centre and quantiles.
 
     Raises:
@@ -146,10 +156,10 @@ def volume_panels(
         8
     """
     require_volume(grid)
-    t = checked_times(times, grid.shape, values=values, z=z)
+    t = checked_times(times, grid.shape, values=values, z=z, hatched=hatched)
     titles = panel_titles(t, titles, unit)
     volumes = [masked("values", each, grid) for each in np.ma.asarray(values)]
-    noise = [None] * t.size if z is None else np.asarray(z)
+    noise, lines = ([None] * t.size if each is None else np.asarray(each) for each in (z, hatched))
     colours = panel_colours(volumes, limits, **kwargs)
     _, shown, chosen = _turned(volumes[0], grid, node, orientation)
 
@@ -170,8 +180,13 @@ def volume_panels(
                 for ax in panels[:, column]:
                     ax.remove()
                 continue
-            style = {"node": node, "orientation": orientation, "z": noise[index], **colours[index]}
-            image = orthogonal_slices(panels[:3, column], volumes[index], grid, **style)
+            style: dict[str, Any] = {
+                "node": node,
+                "orientation": orientation,
+                "z": noise[index],
+                "hatched": lines[index],
+            }
+            image = orthogonal_slices(panels[:3, column], volumes[index], grid, **style, **colours[index])
             panels[0, column].set_title(titles[index], fontsize="medium")
             for ax, (first, second) in zip(panels[:3, column], PLANES, strict=True):
                 normal = 3 - first - second

@@ -59,7 +59,7 @@ class _Bilinear(Contraction):
 
     def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m s n"]:
         """Return Σᵢ cᵢ aᵢ φᵢ(x)."""
-        return _matmul(weights[:, None, :] * self.coefficients(vectors), vectors)
+        return _matmul(weights[:, None, :] * self.coefficients(vectors)[None], vectors)
 
     def mixed(
         self, matrices: Float[Array, "m k k"], vectors: Float[Array, "k n"], matters: Bool[Array, "m k"]

@@ -10,6 +10,7 @@ import scipy
 from jaxtyping import Array, Float
 
 from hks_jax.accuracy import warn_of_accuracy
+from hks_jax.arrays import nan_is_meant
 from hks_jax.checks import checked_times, real_array, require_real
 from hks_jax.domain.tensor_field import TensorField, require_field
 from hks_jax.eigen.eigenpairs import Eigenpairs
@@ -20,11 +21,13 @@ from hks_jax.signatures.truncation import TAIL_LIMIT
 from hks_jax.traced import is_traced
 
 
+@nan_is_meant
 def heat_flow(pairs: Eigenpairs, times: Any, functions: Any) -> Float[Array, "n_times *functions_and_shape"]:
     """Let functions diffuse on the domain: u(t) = Σᵢ exp(−λᵢt) φᵢ ∫φᵢu, the solution of ∂u/∂t = −Δu.
 
-    The diffusion is anisotropic where the metric is. The result is differentiable with respect to functions, times and
-    tensors. The result is NaN outside the mask, and 0 at Dirichlet nodes.
+    The diffusion is anisotropic where the metric is. In the metric D⁻¹ the operator −Δ is not div(D∇·) where the
+    determinant |D| varies; for Fick's law, make the field with ``operator="fick"``. The result is differentiable with
+    respect to functions, times and tensors. The result is NaN outside the mask, and 0 at Dirichlet nodes.
 
     Args:
         pairs: the result of `eigenpairs`. The boundary conditions of the pairs also hold for u. Values at Dirichlet

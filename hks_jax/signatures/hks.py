@@ -1,4 +1,4 @@
-"""The heat kernel signature from eigenpairs, or without them at small times, and the influence of the boundary."""
+"""The heat kernel signature from eigenpairs, or without them at small times."""
 
 import math
 import warnings
@@ -13,16 +13,10 @@ from jaxtyping import Array, Bool, Float
 from hks_jax.accuracy import AccuracyWarning, warn_of_accuracy
 from hks_jax.arrays import nan_is_meant
 from hks_jax.checks import require_number
-from hks_jax.domain.simplicial_mesh import SimplicialMesh
-from hks_jax.domain.tensor_field import TensorField
-from hks_jax.eigen.driver import eigenpairs
 from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.eigen.solver import Eigensolver
-from hks_jax.fem.assembly import assemble
-from hks_jax.fem.boundary import BoundarySpec, normalise_boundary
 from hks_jax.signatures.filters import Heat
 from hks_jax.signatures.spectral_functions import spectral_diagonal, spectral_trace
-from hks_jax.signatures.times import dimension_of, times_of, volume_of
+from hks_jax.signatures.times import dimension_of, measure_of, times_of
 from hks_jax.signatures.truncation import resolved_times, truncation
 from hks_jax.spectrum_free.heat_diagonal import hks_spectrum_free
 from hks_jax.spectrum_free.plan import Unattainable, choose_method, least_work, work
@@ -45,7 +39,6 @@ class AutomaticHKS(eqx.Module):
         tail: (n_times,) the estimated share of the signature that the eigenpairs lack, which decides the method.
         method: the spectrum-free method, ``"colouring"`` or ``"selected-inversion"``; ``"none"`` if it was not used.
         overlap_time: the shortest time from eigenpairs, at which both methods were compared; NaN if they were not.
-        overlap_difference: the greatest difference of the methods at `overlap_time`, relative to (4πt)^(−d/2), or NaN.
         overlap_difference: the greatest difference between the two methods at `overlap_time`, relative to
             (4πt)^(−d/2); NaN without comparison.
     """
@@ -85,14 +78,16 @@ def hks(
     """Compute the heat kernel signature HKS(t, x) = k_t(x, x) = Σᵢ exp(−λᵢt) φᵢ(x)².
 
     See Sun, Ovsjanikov and Guibas 2009, eq. 5, and Zobel, Reininghaus and Hotz, section 2. The unit of ``"raw"`` is
-    1/(metric length)^d. The signature is NaN outside the mask, and 0 at Dirichlet nodes.
+    1/(metric length)^d, and 1/length^d for Fick's operator. The signature is NaN outside the mask, and 0 at Dirichlet
+    nodes.
 
     Args:
         times: (n_times,) positive, in (metric length)².
         normalisation: ``"raw"`` is the signature itself. ``"heat-trace"`` divides it by the heat trace Σᵢ exp(−λᵢt)
-            (Sun et al.). ``"volume"`` multiplies it by the domain's area or volume, so that it tends to 1 for large t,
-            except with a potential or a density. ``"flat"`` multiplies it by (4πt)^(d/2), so that it tends to 1 for
-            small t away from the boundary, or to 1/ρ with a density ρ.
+            (Sun et al.). ``"volume"`` multiplies it by the domain's area or volume, of the metric or of Fick's volume
+            element dx, so that it tends to 1 for large t, except with a potential. ``"flat"`` multiplies it by
+            (4πt)^(d/2), or by (4πt)^(d/2) √|D| for Fick's operator, so that it tends to 1 for small t away from the
+            boundary, or to 1/ρ with a density ρ. At vertices of a mesh, √|D| is the mean over the cells around them.
         method: ``"spectral"`` sums over the pairs. ``"spectrum-free"`` uses only the matrices of the pairs (see
             `hks_spectrum_free`). ``"auto"`` sums over the pairs at times at which the sum is accurate to the tolerance,
             and uses the matrices at the other times; `hks_auto` also reports its choice.
@@ -113,8 +108,8 @@ def hks(
     """
     if method == "spectral":
         times = resolved_times(pairs, times)
-        scale = None if normalisation == "raw" else normaliser(pairs, times, normalisation)
-        return spectral_diagonal(pairs, Heat(times), scale)
+        scale = None if normalisation == "raw" else _of_times(pairs, times, normalisation)
+        return _of_nodes(pairs, normalisation, spectral_diagonal(pairs, Heat(times), scale))
     if method == "auto":
         return hks_auto(pairs, times, normalisation, tolerance).values
     if method != "spectrum-free":
@@ -199,7 +194,7 @@ def _scaled(pairs: Eigenpairs, times: Float[Array, " m"], normalisation: str, va
         raise ValueError(
             'normalisation: got "heat-trace", which needs eigenvalues; use "raw", "volume", "flat" or method="spectral"'
         )
-    return values * normaliser(pairs, times, normalisation).reshape(-1, *[1] * (values.ndim - 1))
+    return values * normaliser(pairs, times, normalisation)
 
 
 def _difference(pairs: Eigenpairs, times: Float[Array, " 1"], tolerance: float, most: float) -> Float[Array, ""]:
@@ -215,85 +210,28 @@ def _difference(pairs: Eigenpairs, times: Float[Array, " 1"], tolerance: float, 
         warnings.simplefilter("ignore", AccuracyWarning)
         spectral = hks(pairs, times)
         other = hks_spectrum_free(pencil, times, method=settings or "selected-inversion", tolerance=tolerance)
-    return jnp.nanmax(jnp.abs(spectral - other)) * (4 * math.pi * times[0]) ** (pairs.space.dimension / 2)
+    return jnp.nanmax(jnp.abs(spectral - other) * normaliser(pairs, times, "flat"))
 
 
-def normaliser(pairs: Eigenpairs, times: Float[Array, " n"], normalisation: str) -> Float[Array, " n"]:
-    """Return the factor at each time by which `hks` multiplies the raw signature."""
+def normaliser(pairs: Eigenpairs, times: Float[Array, " n"], normalisation: str) -> Float[Array, "n *broadcast"]:
+    """Return the factor at each time, and at each node or for all nodes, by which `hks` multiplies the signature."""
+    factors = _of_times(pairs, times, normalisation)
+    return _of_nodes(pairs, normalisation, factors.reshape(-1, *[1] * len(pairs.space.node_shape)))
+
+
+def _of_nodes(pairs: Eigenpairs, normalisation: str, values: Float[Array, "n *any"]) -> Float[Array, "n *shape"]:
+    """Return the values, times √|D| with the normalisation "flat" of Fick's operator."""
+    density = pairs.pencil.density if normalisation == "flat" else None
+    return values if density is None else values * density
+
+
+def _of_times(pairs: Eigenpairs, times: Float[Array, " n"], normalisation: str) -> Float[Array, " n"]:
     if normalisation == "raw":
         return jnp.ones_like(times)
     if normalisation == "heat-trace":
         return 1 / spectral_trace(pairs, Heat(times))
     if normalisation == "volume":
-        return jnp.broadcast_to(volume_of(pairs, 'normalisation="volume"'), times.shape)
+        return jnp.broadcast_to(measure_of(pairs, 'normalisation="volume"'), times.shape)
     if normalisation == "flat":
         return (4 * math.pi * times) ** (dimension_of(pairs, 'normalisation="flat"') / 2)
     raise ValueError(f'normalisation: got {normalisation!r}; expected "raw", "heat-trace", "volume" or "flat"')
-
-
-@nan_is_meant
-def boundary_influence(
-    domain: TensorField | SimplicialMesh | Eigenpairs,
-    times: Any,
-    k: int | None = None,
-    boundary: BoundarySpec = "neumann",
-    solver: str | Eigensolver = "auto",
-) -> Float[Array, "n_times *shape"]:
-    """Return the share of the heat kernel signature that is due to the boundary, (k_N − k_D)/(k_N + k_D).
-
-    Here k_N ≥ k_D are the signatures with Neumann and with Dirichlet conditions on the whole boundary, including the
-    rim of a mask. The share is 1 on the boundary, 0 where the boundary has no effect yet at the time t, and NaN outside
-    the mask. At a distance d from a straight side of a flat domain the share is exp(−d²/t).
-
-    The result is differentiable with respect to the tensors. The eigenpairs of a Neumann and of a Dirichlet problem are
-    computed, which together are the eigenpairs with the boundary ``"mean"`` and the signature (k_N + k_D)/2.
-
-    Args:
-        domain: a metric in 2D or 3D, a mesh, or eigenpairs that were computed with the boundary ``"mean"``.
-        times: (n_times,) positive, in (metric length)².
-        k: the number of eigenpairs of each of the two problems. Omit k if `domain` is given as eigenpairs.
-        boundary: ``"neumann"`` or ``"mean"``, which are equivalent here. Grids also accept ``"periodic"``, as one value
-            for all axes or one per axis. Omit `boundary` if `domain` is given as eigenpairs.
-        solver: the same as for `eigenpairs`.
-
-    Raises:
-        ValueError: if the boundary is invalid, if no node or every node lies on it, or as in `eigenpairs` and `hks`.
-
-    Warns:
-        AccuracyWarning: as in `eigenpairs` and `hks`.
-
-    Examples:
-        >>> influence = hj.boundary_influence(field, [0.2], k=12)[0]
-        >>> print(influence[0, 0], influence[4, 4] < 1)
-        1.0 True
-    """
-    if isinstance(domain, Eigenpairs):
-        if k is not None or boundary != "neumann":
-            raise ValueError("k, boundary: eigenpairs already determine both; omit these arguments")
-        if len(domain.pencil.parts) != 2:
-            raise ValueError('domain: got eigenpairs of another boundary; compute them with boundary="mean"')
-        times = resolved_times(domain, times)
-        free, zero = (spectral_diagonal(domain.of_part(i), Heat(times)) for i in range(2))
-    else:
-        if k is None:
-            raise ValueError("k: got None; expected the number of eigenpairs to compute for each of the two problems")
-        pencil = assemble(domain, _glued(domain, boundary))
-        pairs = (eigenpairs(part, k, solver=solver, multiplet="complete") for part in pencil.parts)
-        free, zero = (hks(each, times) for each in pairs)
-    # Rounding of nearly equal signatures, or truncation of small signatures, may move the ratio out of [0, 1].
-    return jnp.clip((free - zero) / (free + zero), 0, 1)
-
-
-def _glued(domain: TensorField | SimplicialMesh, boundary: BoundarySpec) -> BoundarySpec:
-    """Return the boundary conditions with "mean" on every side that is not periodic."""
-    if not isinstance(domain, TensorField):
-        if boundary not in ("neumann", "mean"):
-            raise ValueError(f'boundary: got {boundary!r}; expected "neumann" for a mesh')
-        return "mean"
-    sides = normalise_boundary(boundary, domain.grid.dimension)
-    if not {condition for pair in sides for condition in pair} <= {"neumann", "mean", "periodic"}:
-        raise ValueError(
-            f'boundary: got {boundary!r}; expected "neumann" or "periodic" for each axis. Neumann and Dirichlet '
-            "conditions are compared on all sides that are not periodic"
-        )
-    return tuple("periodic" if pair == ("periodic", "periodic") else "mean" for pair in sides)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hks_jax.arrays import nan_is_meant
 from hks_jax.checks import require_count, require_number, require_real
 from hks_jax.compilation import numpy_where_known
 from hks_jax.eigen.eigenpairs import Eigenpairs, require_pairs
@@ -53,6 +54,7 @@ def heat_kernel(pairs: Eigenpairs, times: Any, sources: Any) -> Float[Array, "n_
     return spectral_columns(pairs, Heat(resolved_times(pairs, times)), source_indices(pairs, sources))
 
 
+@nan_is_meant
 def scale_invariant_hks(
     pairs: Eigenpairs, n_frequencies: int = 6, n_times: int = 256, times: Any = None
 ) -> Float[Array, "n_frequencies *shape"]:

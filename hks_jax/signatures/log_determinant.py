@@ -63,7 +63,8 @@ def heat_coefficients(
         condition: the condition on the whole boundary.
 
     Raises:
-        ValueError: if the domain is not a surface of known area, or if an angle is outside (0, 2π].
+        ValueError: if the domain is not a surface of known area, if an angle is outside (0, 2π], or if a density or
+            Fick's operator changes the volume element, with which a₂ has further terms.
 
     Examples:
         >>> square = hj.eigenpairs(hj.TensorField(field.grid, np.tile(np.eye(2), (9, 9, 1, 1))), k=4)
@@ -81,6 +82,11 @@ def heat_coefficients(
     require_number("euler_characteristic", euler_characteristic, above=-math.inf)
     require_number("boundary_length", boundary_length, inclusive=True)
     area = volume_of(pairs, "the heat trace")
+    if pairs.pencil.parts[0].weighted_volume is not None:
+        raise ValueError(
+            "pairs: got an operator whose volume element is not that of its metric (Fick's, or with a density); "
+            "expected a Laplace–Beltrami operator, whose a₂ is known. Pass your own coefficients to `log_determinant`"
+        )
     length = jnp.asarray(boundary_length, area.dtype) * (1 if condition == "neumann" else -1)
     constant = euler_characteristic / 6 + float(((math.pi - angles) ** 2 / (24 * math.pi * angles)).sum())
     known = area / (4 * math.pi), length / (8 * math.sqrt(math.pi)), jnp.asarray(constant, area.dtype)
@@ -167,8 +173,8 @@ def log_determinant(
 def _at(pairs: Eigenpairs, a: Float[Array, " m"], d: int, times: Float[Array, "*n"]) -> Float[Array, "*n"]:
     positive = pairs.kept & (pairs.eigenvalues > 0)
     known = jnp.where(positive, pairs.eigenvalues, 1)
-    at = times[..., None]
-    tails = jnp.sum(jnp.where(positive, exponential_integral(known * at), 0), axis=-1)
+    terms = jax.vmap(lambda value: exponential_integral(value * times), out_axes=-1)(known)
+    tails = jnp.sum(jnp.where(positive, terms, 0), axis=-1)
     null = jnp.sum(pairs.kept & (pairs.eigenvalues == 0), dtype=a.dtype)
     powers = (np.arange(a.size) - d) / 2
     terms = sum(a[j] * times**p / p for j, p in enumerate(powers) if p != 0)

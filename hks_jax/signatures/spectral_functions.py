@@ -11,6 +11,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.arrays import StaticArray, nan_outside
+from hks_jax.checks import require_static
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.derivative import products_with_constants
 from hks_jax.eigen.eigenpairs import Eigenpairs
@@ -244,6 +245,7 @@ def _instantiated(tree: Any) -> Any:
 
 def source_indices(pairs: Eigenpairs, sources: object) -> Int[np.ndarray, " s"]:
     """Return flat node indices of sources, given as grid indices (s, d) or (d,), or as vertex numbers (s,) or ()."""
+    require_static("sources", sources)
     shape = pairs.space.node_shape
     array = np.asarray(sources)
     if not np.issubdtype(array.dtype, np.integer):

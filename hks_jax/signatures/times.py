@@ -1,4 +1,4 @@
-"""Checks of eigenpairs and times, default times and energies, and times that suit a metric without eigenpairs."""
+"""Checks of eigenpairs and times, default energies, and times that suit a metric without eigenpairs."""
 
 import math
 from typing import Any
@@ -9,9 +9,9 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Bool, Float
 
-from hks_jax.checks import checked_times, require_count, require_number
+from hks_jax.checks import checked_times, require_count
 from hks_jax.compilation import numpy_where_known
-from hks_jax.domain.components import label_nodes
+from hks_jax.domain.components import active_elements, boundary_nodes, label_nodes
 from hks_jax.eigen.eigenpairs import Eigenpairs, require_pairs
 from hks_jax.eigen.weyl import weyl, weyl_number
 from hks_jax.fem.boundary import BoundarySpec, doubled_problems, normalise_boundary
@@ -29,8 +29,13 @@ def dimension_of(pairs: Eigenpairs, purpose: str) -> int:
 
 
 def volume_of(pairs: Eigenpairs, purpose: str) -> Float[Array, ""]:
-    """Return the area or volume of the domain; raise ValueError if it is not known."""
+    """Return the area or volume of the domain in its metric; raise ValueError if it is not known."""
     return _stated(pairs.pencil.volume, "volume", "domain", purpose)
+
+
+def measure_of(pairs: Eigenpairs, purpose: str) -> Float[Array, ""]:
+    """Return the integral of 1 with the mass; raise ValueError if it is not known."""
+    return _stated(pairs.pencil.measure, "volume", "domain", purpose)
 
 
 def _stated(value: Any, name: str, of: str, purpose: str) -> Any:
@@ -72,25 +77,6 @@ def _n_positive(pairs: Eigenpairs) -> int:
     return pairs.k - pairs.n_null if pairs.null_space_known else pairs.k
 
 
-def default_times(pairs: Eigenpairs, n: int = 16, decay: float = 1e-4) -> Float[Array, " n"]:
-    """Return n times, log-spaced from 4 ln10/λ_last to 4 ln10/λ₁ (Sun, Ovsjanikov and Guibas 2009, section 5).
-
-    At the first of the n times the mode of λ_last has decayed to the fraction 1e-4. At the last of the n times, which
-    is not before the first, all modes except the constant have decayed to at most the fraction `decay`. With the decay
-    0.33 of the command line, √t at the last time is a third of the length of an interval with the same eigenvalue λ₁.
-
-    Examples:
-        >>> times = hj.default_times(pairs, 3)
-        >>> print((times[0] * pairs.eigenvalues[-1]).round(2), (times[-1] * pairs.eigenvalues[1]).round(2))  # 4 ln 10
-        9.21 9.21
-    """
-    require_count("n", n)
-    require_number("decay", decay, 1)
-    first, last = positive_range(pairs)
-    end = jnp.minimum(last, first * (math.log(1e-4) / math.log(decay)))
-    return 4 * jnp.log(10.0).astype(first.dtype) / jnp.geomspace(last, end, n)
-
-
 def default_energies(pairs: Eigenpairs, n: int = 100) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     """Return n energies and the width σ of the wave kernel signature (Aubry, Schlickewei and Cremers 2011).
 
@@ -111,6 +97,8 @@ def default_energies(pairs: Eigenpairs, n: int = 100) -> tuple[Float[Array, " n"
     return jnp.linspace(first + 2 * sigma, last - 2 * sigma, n), sigma
 
 
+FREE = 0.1
+"""The influence of the boundary below which a node counts as free of it: at a distance of 1.5 √t from a flat side."""
 DEFAULT_K = {2: 200, 3: 100}
 """The default number of eigenpairs by dimension. It is smaller in 3D, where factorisations cost more."""
 RESOLVED = {2: 4.6, 3: 5.7}
@@ -139,20 +127,29 @@ def suitable(metric: Any, spacing: Any, inside: Bool[np.ndarray, "*shape"], boun
     along = np.einsum("naa->na", metric) * spacing**2  # the squared distance of neighbours along each axis
     volume = float(np.sqrt(np.linalg.det(metric)).sum() * np.prod(spacing) * share)
     size = float(np.sqrt((np.median(along, axis=0) * steps**2).max()))
-    problems = len(doubled_problems(normalise_boundary(boundary, d)))
-    return suitable_times(d, volume, float(np.median(along.max(axis=1))), size, round(len(metric) * share), problems)
+    sides = normalise_boundary(boundary, d)
+    periodic = tuple(pair == ("periodic", "periodic") for pair in sides[:-1])
+    rim = boundary_nodes(active_elements(inside, periodic), periodic)
+    width = np.sqrt(np.median(along, axis=0))
+    depth = float(np.median(scipy.ndimage.distance_transform_edt(~rim, width)[inside])) if rim.any() else math.inf
+    problems = len(doubled_problems(sides))
+    spacing2, nodes = float(np.median(along.max(axis=1))), round(len(metric) * share)
+    return suitable_times(d, volume, spacing2, size, nodes, problems, depth)
 
 
 def suitable_times(
-    dimension: int, volume: float, width2: float, size: float, nodes: int, problems: int = 1
+    dimension: int, volume: float, width2: float, size: float, nodes: int, problems: int = 1, depth: float = math.inf
 ) -> dict[str, float]:
     """Return a dictionary of times and numbers of eigenpairs that suit a domain.
 
     The node spacing resolves ``least_time``, which takes ``k_for_least_time`` eigenpairs; ``k``, the default number,
     resolves ``least_time_of_k``. `width2` is the squared distance between neighbouring nodes, `size` the greatest
-    extent of the domain, and `problems` the number of even and odd problems under "mean" and "mirror".
+    extent of the domain, `problems` the number of even and odd problems under "mean" and "mirror", and `depth` the
+    median distance of the nodes from the boundary, infinite without a boundary. At the largest time, about half of the
+    nodes are free of the boundary, or, as at ``time_by_size``, √t is half of `size`.
     """
     least, unknowns = COARSE * width2, problems * nodes
+    by_size = LAST * (size / math.pi) ** 2  # an interval of length `size` has λ₁ = (π/size)²
     k = default_k(dimension, unknowns)
     return {
         "least_time": least,
@@ -160,5 +157,7 @@ def suitable_times(
         "k": k,
         "unknowns": unknowns,
         "least_time_of_k": RESOLVED[dimension] / weyl(k, problems * volume, dimension),
-        "largest_time": LAST * (size / np.pi) ** 2,  # an interval of length `size` has λ₁ = (π/size)²
+        # At the distance d from a flat side, exp(−d²/t) is the influence of the boundary.
+        "largest_time": min(by_size, max(depth, 0.0) ** 2 / -math.log(FREE)),
+        "time_by_size": by_size,
     }

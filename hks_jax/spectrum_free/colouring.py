@@ -36,8 +36,8 @@ class Colouring:
         error: for each time, a bound on the signature's error, including rounding errors, relative to the smaller of
             (4πt)^(−d/2) and the largest possible value at a node. For a lumped mass the bound holds unless `top` is too
             small, which has the probability 10⁻⁶. For a consistent mass the bound is proven to first order in the error
-            of the polynomial for M⁻¹, for t → 0 and for a constant metric. For varying metrics, measured errors were at
-            most a fiftieth of the bound.
+            of the polynomial for M⁻¹, for t → 0 and for a constant metric. For varying metrics, measured errors were
+            1.6 times smaller than the bound, or more.
     """
 
     spacing: tuple[int, ...]

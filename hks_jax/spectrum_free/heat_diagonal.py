@@ -63,7 +63,8 @@ def hks_spectrum_free(
             factors in memory. ``"auto"`` chooses the method with less work. Under `jax.jit`, colouring needs a
             `Colouring` from `colouring`.
         tolerance: a bound on the error of colouring at every node, relative to the smaller of (4πt)^(−d/2) and the
-            largest possible value at a node. A potential with the least value v multiplies the bound by exp(−vt).
+            largest possible value at a node. For Fick's operator, (4πt)^(−d/2) is divided by the greatest √|D|. A
+            potential with the least value v multiplies the bound by exp(−vt).
             `Colouring.error` contains the proven bound. Selected inversion ignores the tolerance.
 
     Raises:
@@ -126,8 +127,7 @@ def colouring(
 
 # With the rounding unit ε and the largest eigenvalue λ, selected inversion at a time t had a relative error of at most
 # ελt/10 in measurements. The error of the signature of K − vM is about `_ROUNDING` divided by the least mass for
-# selected inversion. For colouring it is at most a fiftieth of the bound in measurements. The scale exp(−vt) multiplies
-# this error.
+# selected inversion. For colouring it is at most the bound. The scale exp(−vt) multiplies this error.
 def _nan_if_lost(
     values: Float[Array, "m *shape"],
     pencil: AnyPencil,
@@ -160,12 +160,14 @@ def _lost(
         error = max(_ROUNDING, eps) / jnp.min(least)
         late = eps * times * jnp.max(jnp.stack([largest(part) for part in parts])) > _LATE
     else:
-        error = max(settings.error) / 50 * (4 * jnp.pi * times) ** (-len(settings.spacing) / 2)
+        error = max(settings.error) * (4 * jnp.pi * times) ** (-len(settings.spacing) / 2)
+        if parts[0].density is not None:  # as in `bounds`
+            error = error / jnp.max(parts[0].density)
         late = jnp.zeros(times.shape, bool)
     most = jnp.max(jnp.where(jnp.isnan(known), 0, jnp.abs(known)).reshape(times.size, -1), axis=1)
     # Constants, where they are functions of the space, keep the signature far above the error at any time.
     decays = not any(part.n_null for part in parts)
-    return late | decays & ~(error * scale <= 0.01 * most)
+    return late | decays & ~(error * scale <= 0.03 * most)
 
 
 def _read_as_unknowns(pencil: AnyPencil) -> AnyPencil:

@@ -30,8 +30,8 @@ class Bounds(NamedTuple):
     low: Any  # a lower bound on the eigenvalues of D⁻¹M for the row sums D of M; 1 if the mass is lumped
     reach: Float[Array | np.ndarray, " d"]
     across: Float[Array | np.ndarray, " d"]
-    least_mass: Any  # the least entry of D
-    greatest_mass: Any  # the greatest entry of D
+    least_mass: Any  # the least entry of D; for Fick's operator divided by the greatest √|D|, with the diffusivity D
+    greatest_mass: Any  # the greatest entry of D, divided by the same number
 
 
 @jax.jit
@@ -79,4 +79,6 @@ def bounds(pencil: Pencil, low: Float[Array, ""], mass_degree: int) -> Bounds:
         across = jnp.stack(greatest) - 1
     sizes = jnp.abs(entries) / nodal.lumped[None]
     reach = jnp.stack([jnp.max(jnp.sum(sizes[np.flatnonzero(offsets[:, a])], axis=0)) for a in range(d)])
-    return Bounds(top, low, reach, across, jnp.min(jnp.where(nodal.free, sums, jnp.inf)), jnp.max(sums))
+    # The signature of Fick's operator is (4πt)^(−d/2)/√|D| at small times, and errors are relative to its least value.
+    unit = 1 if pencil.density is None else jnp.max(pencil.density)
+    return Bounds(top, low, reach, across, jnp.min(jnp.where(nodal.free, sums, jnp.inf)) / unit, jnp.max(sums) / unit)

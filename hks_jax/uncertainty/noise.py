@@ -112,7 +112,7 @@ class TensorNoise(eqx.Module):
         values = real_array("tensors", tensors)
         rows, columns = np.tril_indices(values.shape[-1])
         isotropic = np.diag(np.where(rows == columns, level**2, level**2 / 2))
-        return cls(isotropic * _squared_mean(values), grid, correlation)
+        return cls(_scaled(isotropic, values), grid, correlation)
 
     @classmethod
     def from_scans(cls, first: Any, second: Any, grid: Grid) -> "TensorNoise":
@@ -152,7 +152,7 @@ class TensorNoise(eqx.Module):
             u, v = (np.moveaxis(parts, axis, 0)[part][x & y] for part in (slice(1, None), slice(None, -1)))
             shared = float(np.sum(u * v) / np.sqrt(np.sum(u * u) * np.sum(v * v))) if u.size else 0.0
             widths.append(h / (2 * math.sqrt(-math.log(min(shared, 0.99)))) if shared > 0.05 else 0.0)
-        return cls(relative * np.asarray(_squared_mean((a + b) / 2)), grid, float(np.mean(widths)))
+        return cls(_scaled(relative, (a + b) / 2), grid, float(np.mean(widths)))
 
     @classmethod
     def from_roughness(cls, tensors: Any, grid: Grid) -> "TensorNoise":
@@ -214,8 +214,10 @@ class TensorNoise(eqx.Module):
         return parts[..., np.maximum(which, which.T)]
 
 
-def _squared_mean(tensors: Any) -> Float[Array, "*shape 1 1"]:
-    return jnp.square(jnp.trace(jnp.asarray(tensors), axis1=-2, axis2=-1) / np.shape(tensors)[-1])[..., None, None]
+def _scaled(relative: Float[np.ndarray, "m m"], tensors: Any) -> Float[Array, "*shape m m"]:
+    """Return a covariance relative to the squared mean eigenvalue of the tensors (*shape, d, d) in absolute units."""
+    squared = jnp.square(jnp.trace(jnp.asarray(tensors), axis1=-2, axis2=-1) / np.shape(tensors)[-1])
+    return jnp.multiply.outer(squared, jnp.asarray(relative, squared.dtype))
 
 
 def _check_semidefinite(covariance: Float[np.ndarray, "*shape m m"]) -> None:

@@ -168,7 +168,7 @@ def draw(path: Path, grid: hj.Grid, bars: list[hj.Uncertainty], times: np.ndarra
         for ax, i in zip(line, chosen, strict=True):
             value = np.asarray(shown.value[i])
             reach = float(np.nanquantile(np.abs(value - 1), 0.97))
-            z = np.asarray(shown.z(1.0)[i])[box] if each is shown else None
+            z = np.asarray(shown.z()[i])[box] if each is shown else None
             colours = {"vmin": 1 - reach, "vmax": 1 + reach, "cmap": "RdBu_r"}
             hj.plot.scalar_image(ax, np.asarray(each.value[i])[box], small, orientation=orientation, z=z, **colours)
             ax.set_title(rf"{name}, $\sqrt{{Dt}}$ = {LENGTHS[i]:.2g} voxels", fontsize="small")

@@ -23,9 +23,10 @@ import hks_jax as hj
 from hks_jax.cli import build_parser, main
 from hks_jax.cli.computation import Settings
 from hks_jax.cli.progress import StudyProgress
-from hks_jax.cli.study.batch import common_times, suitable_range
+from hks_jax.cli.study.batch import Range, common_times, suitable_range
 from hks_jax.cli.study.folder import Study
 from hks_jax.cli.study.subjects import read_subjects
+from hks_jax.cli.study.tasks import Outcome
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
 from hks_jax.io.masks import names_beside, read_names
 from hks_jax.io.nifti import component_of
@@ -303,7 +304,7 @@ def test_a_study_is_a_bids_derivative(study, monkeypatch):
 
     # The regions of a signature that is computed again without labels are gone.
     assert (out / "group_regions.tsv").is_file()
-    words = command(study, "out", "--times", "3e3", "--only", "sub-01", "--replace", "--normalisation", "flat", "-q")
+    words = command(study, "out", "--times", "3e3", "--only", "sub-01", "--replace", "--normalisation", "raw", "-q")
     assert main([word for word in words if word not in ("--atlas", str(atlas))]) == 0
     assert not list(out.rglob("*regions*"))
 
@@ -328,7 +329,7 @@ def test_one_bad_subject_does_not_stop_the_others(study, monkeypatch, capsys):
 
 def test_subjects_in_other_units_are_refused_and_open_frames_are_said(study, monkeypatch, capsys):
     monkeypatch.setattr(
-        "hks_jax.cli.study.tasks.signature_panels", lambda result, path, view: path.write_text("picture")
+        "hks_jax.cli.study.tasks.signature_panels", lambda result, path, **_: path.write_text("picture")
     )
     image = nib.load(study / "t1.nii.gz")
     for number, matrix, scale in ((4, AFFINE, 1e6), (5, AFFINE, 1e6), (6, AFFINE @ np.diag([-1.0, 1, 1, 1]), 1.0)):
@@ -358,7 +359,7 @@ def test_subjects_in_other_units_are_refused_and_open_frames_are_said(study, mon
 
 def test_numbers_without_a_unit_are_compared_within_the_study(study, monkeypatch, capsys):
     monkeypatch.setattr(
-        "hks_jax.cli.study.tasks.signature_panels", lambda result, path, view: path.write_text("picture")
+        "hks_jax.cli.study.tasks.signature_panels", lambda result, path, **_: path.write_text("picture")
     )
     for i, scale in enumerate((1e3, 0.8e3, 1e6)):  # two in um2/ms, one in um2/s
         np.savez(study / f"n{i}.npz", tensors=tensors(scale), spacing=(2.0, 2.0, 3.0))
@@ -427,17 +428,20 @@ def test_rows_join_the_options_of_the_command(tmp_path):
 
 
 def test_common_times_suit_all_subjects():
-    ranges = {"sub-01": (2.0, 50.0), "sub-02": (3.0, 80.0)}
-    assert common_times(ranges, 3, "scanner") == (3.0, 12.2, 50.0)
+    ranges = {"sub-01": Range(2.0, 25.0, 50.0), "sub-02": Range(3.0, 48.0, 80.0)}
+    assert common_times(ranges, 3, "scanner") == (3.0, 8.66, 25.0)
     scaled = common_times(ranges, 2, "lambda1")
-    np.testing.assert_allclose(scaled, np.pi**2 / 4 * np.array([2 / 50, 1]), rtol=5e-3)
+    np.testing.assert_allclose(scaled, np.pi**2 / 4 * np.array([2 / 50, 1 / 2]), rtol=5e-3)
+    # If half of the voxels are free of the boundary only at unresolved times, the times are the first resolved ones.
+    assert common_times({"sub-01": Range(4.0, 1.0, 50.0)}, 2, "scanner") == (4.0, 8.0)
+    assert common_times({"sub-01": Range(4.0, 1.0, 5.0)}, 2, "scanner") == (4.0, 5.0)
     with pytest.raises(ValueError, match="sub-02 resolves only t ≥ 4, and the size of sub-01 allows only t ≤ 3"):
-        common_times({"sub-01": (2.0, 3.0), "sub-02": (4.0, 9.0)}, 3, "scanner")
+        common_times({"sub-01": Range(2.0, 1.0, 3.0), "sub-02": Range(4.0, 5.0, 9.0)}, 3, "scanner")
 
 
 def test_automatic_times_follow_the_metric_and_remain_those_of_the_study(study, monkeypatch, capsys):
-    def suitable(scale, k, boundary):
-        args = argparse.Namespace(file=Path("t.nii"), metric="inverse", k=k, boundary=boundary)
+    def suitable(scale, k, boundary, metric="inverse", operator="laplace-beltrami"):
+        args = argparse.Namespace(file=Path("t.nii"), metric=metric, operator=operator, k=k, boundary=boundary)
         # So many voxels that k, and not their size, limits t; in an image much larger.
         many = np.zeros((60, 60, 20, 3, 3))
         many[3:30, 4:28, 5:14] = np.tile(tensors(scale), (3, 3, 3, 1, 1))
@@ -445,15 +449,16 @@ def test_automatic_times_follow_the_metric_and_remain_those_of_the_study(study, 
 
     np.testing.assert_allclose(suitable(2.0, 8, "neumann"), suitable(1.0, 8, "neumann") / 2, rtol=1e-12)
     np.testing.assert_allclose(suitable(1.0, 8, "mean"), suitable(1.0, 4, "neumann"), rtol=1e-12)
+    np.testing.assert_array_equal(suitable(1.0, 8, "mean", None, "fick"), suitable(1.0, 8, "mean"))
     side = 54.0  # mm, of the largest axis, along which D is about 1.5e-3 mm²/s
-    assert abs(suitable(1.0, 8, "neumann")[1] / ((side / 2) ** 2 / 1.5e-3) - 1) < 0.3
+    assert abs(suitable(1.0, 8, "neumann")[2] / ((side / 2) ** 2 / 1.5e-3) - 1) < 0.3
     assert suitable(1.0, 1, "neumann")[0] > suitable(1.0, 8, "neumann")[0]
 
     def times(*more):
         assert main([*command(study, "out", "--times", "auto:2", *more), "-q"]) == 0
         return json.loads((study / "out" / "study.json").read_text())["times"]
 
-    monkeypatch.setattr("hks_jax.cli.study.tasks.run_all", lambda *_: {})
+    monkeypatch.setattr("hks_jax.cli.study.tasks.run_all", lambda *_: Outcome({}, []))
     monkeypatch.setattr(Study, "write_group", lambda *_: [])
     save_tensors(study / "t3.nii.gz", volume(0.9))
     first = times()
@@ -461,6 +466,13 @@ def test_automatic_times_follow_the_metric_and_remain_those_of_the_study(study, 
         stream.write("04\tt1.nii.gz\tcontrol\n05\tt4.nii.gz\tcontrol\n")
     save_tensors(study / "t4.nii.gz", volume(0.8))
     assert times() == first
+    fick = [each for each in command(study, "out") if each not in ("--metric", "inverse")]
+    assert main([*fick, "--metric", "inverse", "--operator", "fick"]) == 2
+    assert "--metric: got inverse with --operator fick" in capsys.readouterr().err
+    assert main([*fick, "--times", "auto:2", "--operator", "fick"]) == 2
+    said = capsys.readouterr().err
+    assert "--metric inverse, not unset" in said
+    assert "--operator laplace-beltrami, not fick" in said
     other = ("--interpolation", "log-euclidean")
     assert main(command(study, "out", "--times", "auto:2", *other)) == 2
     assert "has --interpolation linear, not log-euclidean. Leave" in capsys.readouterr().err
@@ -613,7 +625,7 @@ def test_a_study_keeps_the_boundary_that_it_began_with(study, monkeypatch, capsy
         assert main(command(study, out, "--times", "3e3", *more)) == 0
         return json.loads((study / out / "study.json").read_text())["settings"]["boundary"]
 
-    monkeypatch.setattr("hks_jax.cli.study.tasks.run_all", lambda *_: {})
+    monkeypatch.setattr("hks_jax.cli.study.tasks.run_all", lambda *_: Outcome({}, []))
     monkeypatch.setattr(Study, "write_group", lambda *_: [])
     assert boundary("new") == "mean"
     assert "options for all subjects: --boundary mean\n" in capsys.readouterr().err
@@ -625,9 +637,9 @@ def test_a_study_keeps_the_boundary_that_it_began_with(study, monkeypatch, capsy
 
 
 def test_omitted_options_are_those_of_the_study(study, monkeypatch, capsys):
-    monkeypatch.setattr("hks_jax.cli.study.tasks.run_all", lambda *_: {})
+    monkeypatch.setattr("hks_jax.cli.study.tasks.run_all", lambda *_: Outcome({}, []))
     monkeypatch.setattr(Study, "write_group", lambda *_: [])
-    kept = ["--normalisation", "flat", "--repair", "clip:1e-4", "--times", "3e3", "6e3", "--time-unit", "lambda1"]
+    kept = ["--normalisation", "raw", "--repair", "clip:1e-4", "--times", "3e3", "6e3", "--time-unit", "lambda1"]
     assert main(command(study, "out", "--erode", "0", *kept)) == 0
     record = (study / "out" / "study.json").read_text()
     capsys.readouterr()
@@ -635,16 +647,16 @@ def test_omitted_options_are_those_of_the_study(study, monkeypatch, capsys):
     assert main(short) == 0
     assert (study / "out" / "study.json").read_text() == record
     printed = capsys.readouterr().err
-    for option in ("-k 8", "--slice z=1", "--repair clip:0.0001", "--times 3000.0,6000.0", "--normalisation flat"):
+    for option in ("-k 8", "--slice z=1", "--repair clip:0.0001", "--times 3000.0,6000.0", "--normalisation raw"):
         assert option in printed
-    assert main([*short, "-k", "9", "--normalisation", "raw", "--times", "auto:4", "--noise", "0.1"]) == 2
+    assert main([*short, "-k", "9", "--normalisation", "flat", "--times", "auto:4", "--noise", "0.1"]) == 2
     printed = capsys.readouterr().err
-    for text in ("-k 8, not 9;", "--normalisation flat, not raw;", "--times 3000.0,6000.0, not auto:4;"):
+    for text in ("-k 8, not 9;", "--normalisation raw, not flat;", "--times 3000.0,6000.0, not auto:4;"):
         assert text in printed
     assert "--noise unset, not 0.1" in printed
     assert "Leave these options out to continue the study" in printed
     assert main([*short, "-k", "9", "--metric", "inverse", "--slice", "z=1", "--times", "9", "--replace"]) == 0
-    assert json.loads((study / "out" / "study.json").read_text())["settings"]["normalisation"] == "raw"
+    assert json.loads((study / "out" / "study.json").read_text())["settings"]["normalisation"] == "flat"
 
 
 @pytest.mark.slow

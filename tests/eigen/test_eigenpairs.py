@@ -104,7 +104,7 @@ def test_solvers_agree(rng, boundary, mass):
     assert sparse.converged.all()
     np.testing.assert_allclose(sparse.eigenvalues, dense.eigenvalues, rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(sparse.next_eigenvalue, dense.next_eigenvalue, rtol=1e-10)
-    times = hj.default_times(dense, 3)[1:]
+    times = 4 * np.log(10) / dense.eigenvalues[np.array([5, 1])]
     np.testing.assert_allclose(hj.hks(sparse, times), hj.hks(dense, times), rtol=1e-9, atol=1e-9)
 
 
@@ -174,7 +174,7 @@ def two_squares() -> hj.TensorField:
 
 def test_a_cut_multiplet_is_reported():
     field = flat((12, 12), (1.0, 1.0))  # λ₁ = λ₂ by symmetry
-    with pytest.warns(hj.AccuracyWarning, match="part of its eigenspace. Take a larger k$"):
+    with pytest.warns(hj.AccuracyWarning, match="eigenspace. Take the k that `count_eigenvalues` counts just"):
         hj.eigenpairs(two_squares(), 1)
     with pytest.warns(hj.AccuracyWarning, match="k = 2 cuts a multiple eigenvalue: the last 1 pair.*Take k = 1 or"):
         pairs = hj.eigenpairs(field, 2)

@@ -18,6 +18,7 @@ from skfem.helpers import dot
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 import hks_jax as hj
+from hks_jax.eigen import inertia
 from hks_jax.eigen.inertia import locate
 from hks_jax.eigen.quality import measure_pairs, measured_on_host
 
@@ -223,6 +224,107 @@ def test_what_is_refused():
 def test_a_cut_multiple_eigenvalue_is_told():
     with pytest.warns(hj.AccuracyWarning, match=r"k = 3 cuts a multiple eigenvalue: the last 2"):
         hj.eigsh(lattice(12), k=3)
+
+
+def turned(values) -> np.ndarray:
+    """A full matrix of these eigenvalues."""
+    frame = np.linalg.qr(np.random.default_rng(0).standard_normal((len(values), len(values))))[0]
+    matrix = frame @ np.diag(values) @ frame.T
+    return (matrix + matrix.T) / 2
+
+
+BOTTOMS = {  # a matrix, the number of copies of its lowest eigenvalue, a k that cuts it
+    "a turned matrix": (lambda: turned([1.0, 1, 7, 7]), 2, 1),
+    "copies of a chain": (lambda: paths(3, 20).toarray(), 3, 2),
+    "copies of a chain far from zero": (lambda: paths(3, 20).toarray() - 2 * np.eye(60), 3, 2),
+    "a high multiplicity": (lambda: turned([3.0] * 20 + [5.0] * 5), 20, 12),
+}
+
+
+@pytest.mark.parametrize("name", BOTTOMS)
+@pytest.mark.parametrize("solver", ["dense", "shift-invert", SOLVER])
+def test_a_cut_lowest_eigenvalue_is_told(name, solver):
+    """Its copies differ by rounding, of which no distance from the lowest of them tells."""
+    made, copies, k = BOTTOMS[name]
+    matrix = made()
+    remedy = rf"k = {k} cuts a multiple eigenvalue: the last {k} pair.*Take the k that `count_eigenvalues` counts"
+    with pytest.warns(hj.AccuracyWarning, match=remedy):  # and no other warning: those would be errors
+        pairs = hj.eigenpairs(matrix, k, solver=solver, multiplet="drop")
+    assert pairs.cut_multiplet == k
+    above = float(pairs.eigenvalues[0]) + 1e-3
+    assert hj.count_eigenvalues(matrix, above) == copies  # the advice
+    whole = hj.eigenpairs(matrix, copies, solver=solver)
+    assert whole.cut_multiplet == 0
+    if copies - k <= 8:
+        assert hj.eigenpairs(matrix, k, solver=solver, multiplet="complete").kept.sum() == copies
+    # What is reported does not depend on how unknowns are numbered; the complete signature does not either.
+    order = np.random.default_rng(1).permutation(len(matrix))
+    other = hj.eigenpairs(matrix[np.ix_(order, order)], copies, solver=solver)
+    np.testing.assert_allclose(hj.hks(other, [0.5])[0], hj.hks(whole, [0.5])[0][order], rtol=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("solver", ["dense", SOLVER])
+def test_a_cut_lowest_eigenvalue_is_known_under_jit(solver, dtype):
+    pencil = hj.sparse_pencil(paths(3, 12).astype(dtype))
+
+    @eqx.filter_jit
+    def kept(pencil, k, choice):
+        pairs = hj.eigenpairs(pencil, k, solver=solver, multiplet=choice)
+        return pairs.cut_multiplet, pairs.kept.sum()
+
+    assert kept(pencil, 2, "report") == (2, 2)
+    assert kept(pencil, 4, "drop") == (0, 3)
+
+
+def test_a_circulant_raises_no_false_alarm():
+    column = np.random.default_rng(0).standard_normal(128)
+    matrix = scipy.linalg.circulant((column + np.roll(column[::-1], 1)) / 2)  # its eigenvalues are double, but for two
+    with pytest.warns(hj.AccuracyWarning, match="k = 1 cuts a multiple eigenvalue"):
+        pairs = hj.eigenpairs(matrix, 1, solver="shift-invert")
+    assert pairs.result == hj.RESULTS.successful
+    assert pairs.eigenvalues[0] == pytest.approx(np.linalg.eigvalsh(matrix)[0], rel=1e-13)
+
+
+@pytest.mark.parametrize("boundary", ["mirror", "mean"])
+def test_an_interval_that_ends_at_an_eigenvalue_of_a_doubled_domain_is_refused(boundary):
+    """The pivot that vanishes there has a sign, by which one part was counted within and another without."""
+    for seed in (4, 5):
+        rng = np.random.default_rng(seed)
+        shape = tuple(int(n) for n in rng.integers(5, 8, 2))
+        mask = np.ones(shape, bool)
+        mask[0, 0] = boundary == "mirror"
+        grid = hj.Grid(shape, tuple(rng.uniform(0.1, 0.3, 2).round(3)), mask=mask)
+        pencil = hj.assemble(hj.TensorField(grid, np.broadcast_to(np.eye(2), (*shape, 2, 2))), boundary)
+        dense = [[np.asarray(m.to_dense()) for m in (part.stiffness, part.mass)] for part in pencil.parts]
+        exact = np.sort(np.concatenate([scipy.linalg.eigh(K, M, eigvals_only=True) for K, M in dense]))
+        for i in range(2, 8):
+            for ends in ((exact[i], 1.5 * exact[-1]), (exact[i] / 2, exact[i])):
+                with pytest.raises(ValueError, match=r"interval: got .* too close to an eigenvalue"):
+                    hj.eigenpairs(pencil, interval=ends, solver="dense")
+        low, high = exact[2] * (1 - 1e-5), exact[7] * (1 - 1e-5)
+        pairs = hj.eigenpairs(pencil, interval=(low, high), solver="dense")
+        np.testing.assert_allclose(pairs.eigenvalues, exact[(exact >= low) & (exact < high)], rtol=1e-10)
+
+
+def test_a_nearly_incompressible_body_is_located_by_few_factorisations(monkeypatch):
+    """Its largest eigenvalue is 1e10 times as large as those wanted, of which rounding separates few from zero."""
+    mesh = MeshTet.init_tensor(*(np.linspace(0, 1, 5),) * 3)
+    basis = Basis(mesh, ElementVector(ElementTetP1()))
+    mass = BilinearForm(lambda u, v, _: dot(u, v)).assemble(basis)
+    pencil = hj.sparse_pencil(linear_elasticity(1e9, 1.0).assemble(basis), mass)
+    K, M = pencil.stiffness.to_scipy().toarray(), pencil.mass.to_scipy().toarray()
+    exact, shifts, counting = scipy.linalg.eigh(K, M, eigvals_only=True), [], inertia._counting
+
+    def counted(pencil, probes):
+        count = counting(pencil, probes)
+        return lambda shift: (shifts.append(float(shift)), count(shift))[1]
+
+    monkeypatch.setattr(inertia, "_counting", counted)
+    low, above, number = map(float, inertia.locate(pencil, 4, 8))
+    assert len(shifts) < 20
+    assert low < exact[0]
+    assert number == np.sum(exact < above)
 
 
 def twelve_graphs() -> sp.csc_matrix:

@@ -8,7 +8,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 from annotations import unchecked
-from fields import random_spd
+from fields import random_spd, turning
 
 import hks_jax as hj
 from hks_jax.domain import spd
@@ -593,3 +593,27 @@ def test_fits_can_be_pickled_with_every_named_setting():
     assert [list(table) for table in again[:3]] == [list(table) for table in settings[:3]]
     assert again[0]["relative"](jnp.array(3.0), jnp.array(2.0)) == 0.5
     assert again[2]["rotation"].start(jnp.ones((5, 3, 3))).shape == (5, 3)
+
+
+def _full(grid):
+    """A metric with a shear, which no conformal factor explains."""
+    return hj.TensorField(grid, turning(grid.nodes, 2.0, 0.7))
+
+
+@pytest.mark.parametrize(("parametrisation", "finer"), [("conformal", 1), ("log-euclidean", 2)])
+def test_a_target_that_the_metric_does_not_explain_is_told_without_noise(parametrisation, finer):
+    grids = [hj.Grid.from_bounds(0, 1, (n, n)) for n in (8, 7 * finer + 1)]
+    times = np.array([0.05, 0.2])
+    pairs = hj.eigenpairs(_full(grids[1]), 40, solver="dense")
+    target = hj.hks(pairs, times)[:, ::finer, ::finer]
+    search = hj.inverse.Search(max_steps=4)
+    with pytest.warns(
+        hj.AccuracyWarning, match=r"target: the fit ended .* with residuals of .* pass its error as noise"
+    ):
+        hj.fit_metric(grids[0], target, times, parametrisation, k=40, search=search)
+
+
+def test_a_mesh_is_refused_with_what_to_do_instead():
+    mesh = hj.SurfaceMesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]]))
+    with unchecked(), pytest.raises(TypeError, match=r"init: got SurfaceMesh; .* on grids only\. .*value_and_grad"):
+        hj.fit_metric(mesh, np.ones((1, 3)), [0.1])

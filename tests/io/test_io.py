@@ -485,7 +485,7 @@ def test_fit_recovers_the_tensors_of_a_perfect_scan(scan, volume):
     np.testing.assert_allclose(fit.tensors[volume.mask], volume.tensors[volume.mask], rtol=1e-5, atol=1e-8)
     assert not fit.tensors[~volume.mask].any()
     np.testing.assert_allclose(fit.spacing, volume.spacing, rtol=1e-6)
-    assert fit.notes[0] == "weighted least-squares fit to 15 of 25 images (b ≤ 800 s/mm²)"
+    assert fit.notes[0] == "weighted least-squares fit to 15 of 25 images (2 at b = 0, 13 at b = 800 s/mm²)"
 
 
 @pytest.mark.parametrize("flip", [1, -1])
@@ -535,7 +535,7 @@ def test_a_scan_without_a_mask_is_masked_by_dipy(tmp_path):
 
 def test_bad_scans(scan, volume):
     names = scan / "dwi.nii.gz", scan / "b", scan / "g"
-    with pytest.raises(ValueError, match="leaves 0 weighted and 2 unweighted images"):
+    with pytest.raises(ValueError, match=r"b_max: got 10: the 2 images .* only 1 of the 7.*Raise the limit"):
         hj.io.fit_dwi(*names, volume.mask, b_max=10)
     np.savetxt(scan / "short", np.zeros((1, 7)))
     with pytest.raises(ValueError, match="7 b-values"):
@@ -582,7 +582,7 @@ def test_results_come_back_as_they_were_saved(tmp_path, rng, times):
     volume = TensorVolume(tensors, (2.0, 3.0), (1.0, 0.0), mask, affine, 1, **about)
     values = np.where(mask, rng.random((max(times.size, 1), 6, 5)), np.nan)
     settings = {"metric": "inverse", "normalisation": "flat", "boundary": (("neumann", "mean"), "periodic")}
-    arrays = {"deviation": 0.1 + values} if times.size else {}
+    arrays = {"deviation": 0.1 + values, "z": 2 * values} if times.size else {}
     result = hj.io.Result(volume, values, times, np.arange(3.0), {"settings": settings}, arrays)
     result.save(tmp_path / "hks", "")
     read = hj.io.Result.read(tmp_path, over_times=bool(times.size))
@@ -597,7 +597,7 @@ def test_results_come_back_as_they_were_saved(tmp_path, rng, times):
     assert (replace(result, place=bare).unit, replace(result, place=bare).length_unit) == ("", "")
     if times.size:
         assert repr(read) == f"Result(hks: float64 (2, 6, 5), 2 times 1 … 2.5 s, source='{tmp_path / 'hks.npz'}')"
-        np.testing.assert_allclose(read.z, (values - 1) / (0.1 + values))
+        np.testing.assert_array_equal(read.z, 2 * values)
     else:
         assert read.z is None
 

@@ -132,6 +132,20 @@ def test_tetrahedra_and_arrays_there_and_back(tmp_path, suffix, rng):
         save(tmp_path / "b.ply", values[0], SOLID)
 
 
+@pytest.mark.parametrize("suffix", ["vtu", "vtk", "msh", "ply", "npz"])
+def test_names_that_no_format_can_hold_are_refused_by_all(tmp_path, suffix):
+    mesh, values = hj.SurfaceMesh(*octahedron()), np.arange(6.0)
+    for name in ("", "a b", "t<1", 'a"b', "a\nb", "λ"):
+        with pytest.raises(ValueError, match=r"name: got the name .*; expected letters a–z, digits"):
+            save(tmp_path / f"m.{suffix}", values, mesh, name=name)
+        with pytest.raises(ValueError, match=r"extra: got the name"):
+            save(tmp_path / f"m.{suffix}", values, mesh, extra={name: np.zeros(2)})
+    assert not list(tmp_path.iterdir())
+    path = save(tmp_path / f"m.{suffix}", values, mesh, name="FA_1.5-x")
+    arrays = np.load(path) if suffix == "npz" else read_mesh_arrays(path)
+    np.testing.assert_array_equal(arrays["FA_1.5-x"], values)
+
+
 def test_cleaned_tetrahedra_and_their_arrays(tmp_path, rng):
     """Split into corners, some in the other order, with a flat one and a vertex without any: as at first."""
     corners, cells = np.asarray(SOLID.vertices)[SOLID.cells].reshape(-1, 3), np.arange(640).reshape(-1, 4)

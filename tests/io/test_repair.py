@@ -1,5 +1,8 @@
 """Tensors that are not positive definite: refused with the choices, or mended and reported."""
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from annotations import unchecked
@@ -7,7 +10,7 @@ from annotations import unchecked
 import hks_jax as hj
 from hks_jax.cli import main
 from hks_jax.io import TensorVolume, find_invalid, read_tensors, repair_tensors
-from hks_jax.io.repair import require_valid
+from hks_jax.io.repair import least_admissible, positive_tensors, require_valid
 
 SHAPE = (8, 9)
 BAD = [(2, 3), (4, 1)]
@@ -129,3 +132,125 @@ def test_the_command_line_refuses(tmp_path, volume, capsys):
     assert 'Choose --repair: "clip" (raise eigenvalues to a floor), "mask"' in error
     assert main([*arguments, "--repair", "abs"]) == 2
     assert "such as clip:1e-4" in capsys.readouterr().err
+
+
+# ------------------------------------------------------------------------------------------------ nearly singular
+
+
+def tissue(**units):
+    """A volume in mm: white matter, grey matter and CSF, and one voxel whose fit DIPY clipped."""
+    i = np.indices((10, 9, 4))[0]
+    values = np.select(
+        [i[..., None] < 4, i[..., None] < 8], [[1.7e-3, 2.5e-4, 1.5e-4], [9e-4, 8e-4, 7e-4]], [3e-3, 3e-3, 2.9e-3]
+    )
+    tensors = values[..., None] * np.eye(3)
+    tensors[1, 2, 3] = np.diag([8e-4, 6e-4, 1.08e-9])
+    return TensorVolume(tensors, (2.0, 2.0, 2.0), (0.0,) * 3, affine=np.eye(4), **{"length_unit": "mm", **units})
+
+
+@pytest.mark.parametrize("unit", ["", "mm²/s"])
+def test_nearly_singular_diffusion_tensors_are_refused_asked_about_and_mended(unit):
+    volume = tissue(unit=unit)
+    found = find_invalid(volume)
+    assert np.argwhere(found).tolist() == [[1, 2, 3]]
+    words = rf"1 of 360 tensors are nearly singular, with an eigenvalue below 8e-06{f' {unit}' * bool(unit)}, worst"
+    with pytest.raises(
+        ValueError, match=rf"{words} eigenvalue 1\.08e-09 \(the first at voxel \(1, 2, 3\)\).*clip:1e-12"
+    ):
+        require_valid(volume)
+    (question,) = hj.io.questions(volume)
+    assert question.startswith("Nearly singular? 1 of 360 tensors are nearly singular")
+    for method in ("nearest", "mask", "clip"):
+        mended = repair_tensors(volume, method)  # without a floor
+        require_valid(mended)
+        assert (mended.repair["voxels"], mended.repair["first"]) == (1, [[1, 2, 3]])
+        assert (
+            "have an eigenvalue below 8e-06 (the worst eigenvalue is 1.08e-09), the first at voxel (1, 2, 3)"
+            in (mended.notes[-1])
+        )
+        assert hj.io.questions(mended) == ()
+    require_valid(repair_tensors(volume, "clip", 1e-12))  # as asked
+    assert np.linalg.eigvalsh(repair_tensors(volume, "clip").tensors[1, 2, 3])[0] == pytest.approx(8e-6)
+    require_valid(repair_tensors(replace(volume, tensors=volume.tensors.astype(np.float32)), "clip", 1e-9))
+
+
+def test_what_tissue_phantoms_and_metrics_have_is_no_false_alarm():
+    whole = tissue()
+    sound = replace(whole, tensors=np.where(find_invalid(whole)[..., None, None], 8e-4 * np.eye(3), whole.tensors))
+    sticks = np.broadcast_to(np.diag([1.7e-3, 1e-5, 1e-5]), sound.tensors.shape)
+    metric = np.broadcast_to(np.diag([1.0, 1.0, 1e-6]), sound.tensors.shape).copy()
+    metric[0] = np.eye(3)
+    for volume in (
+        sound,
+        replace(sound, tensors=0.2 * sound.tensors, unit="mm²/s"),  # fixed tissue beside its fluid
+        replace(sound, tensors=sticks, unit="mm²/s"),  # simulated sticks, FA 0.99
+        replace(sound, tensors=metric),  # a metric in an image: its eigenvalues are not diffusivities
+        replace(whole, length_unit=""),  # no unit at all
+        positive_tensors(replace(whole, tensors=1e9 * whole.tensors), "exp", 2e5),  # exp of stresses
+    ):
+        require_valid(volume)
+        assert not [text for text in hj.io.questions(volume) if "singular" in text]
+    assert least_admissible(replace(sound, tensors=1e-9 * sound.tensors, unit="mm²/s")) == pytest.approx(1e-7)
+
+
+def test_commands_refuse_and_mend_nearly_singular_tensors(tmp_path, capsys):
+    pytest.importorskip("nibabel")
+    volume = tissue()
+    path = str(hj.io.save_tensors(tmp_path / "t.nii.gz", volume))
+    assert main(["info", path]) == 0
+    text = capsys.readouterr().out
+    assert "1 tensors are nearly singular, with an eigenvalue below 8e-06, a hundredth" in text
+    assert main(["info", path, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["not_positive_definite"], found["nearly_singular"]) == (0, 1)
+    times = found["suits"]["inverse"]
+    assert main(["info", path, "--json", "--repair", "nearest"]) == 0
+    mended = json.loads(capsys.readouterr().out)
+    assert mended["nearly_singular"] == 0
+    assert times["least_time_of_k"] == pytest.approx(mended["suits"]["inverse"]["least_time_of_k"], rel=0.1)
+    arguments = ["hks", path, "-o", str(tmp_path / "out"), "--metric", "inverse"]
+    assert main([*arguments, "-q"]) == 2
+    assert "1 of 360 tensors are nearly singular" in (error := capsys.readouterr().err)
+    assert 'Choose --repair: "clip"' in error
+    assert main(["convert", path, str(tmp_path / "s.nii.gz")]) == 0
+    assert "warning: 1 tensors are nearly singular, with" in capsys.readouterr().err
+    np.savez(tmp_path / "hks.npz", hks=np.ones((1, 10, 9, 4)), times=[1.0], spacing=[2.0] * 3, origin=[0.0] * 3)
+    arguments = ["fit", str(tmp_path / "hks.npz"), "-o", str(tmp_path / "f"), "--init", path, "--metric", "inverse"]
+    assert main(arguments) == 2
+    assert "--init: 1 of 360 tensors are nearly singular" in (error := capsys.readouterr().err)
+    assert "hks-jax convert" in error
+
+
+# ---------------------------------------------------------------------------------------------------- stress
+
+
+def test_a_stress_of_zero_is_inside(tmp_path, capsys):
+    """exp(0) = I is as good as any; only diffusion tensors are zero in the background."""
+    stress = np.zeros((12, 10, 2, 2))
+    x, y = (a / 11 for a in np.indices((12, 10)))
+    stress[..., 0, 0], stress[..., 1, 1], stress[..., 0, 1] = 1e6 * x, -1e6 * y, 2e5 * x * y
+    stress[..., 1, 0] = stress[..., 0, 1]
+    stress[6, 5] = 0
+    volume = TensorVolume(stress, (0.1, 0.1), (0.0, 0.0))
+    mapped = positive_tensors(volume, "exp", 2e6)
+    assert mapped.mask is None
+    np.testing.assert_array_equal(mapped.tensors[6, 5], np.eye(2))
+    np.savez(tmp_path / "s.npz", tensors=stress, spacing=[0.1, 0.1])
+    arguments = [str(tmp_path / "s.npz"), "--positive", "exp:2e6"]
+    assert main(["hks", *arguments, "-o", str(tmp_path / "out"), "-k", "6", "--times", "0.1"]) == 0
+    said = capsys.readouterr().err
+    assert "outside" not in said
+    assert json.loads((tmp_path / "out" / "report.json").read_text())["settings"]["boundary"] == "neumann"
+    assert np.isfinite(np.load(tmp_path / "out" / "hks.npz")["hks"]).all()
+    stress[8:] = 0  # probably a background, which a warning names
+    np.savez(tmp_path / "s.npz", tensors=stress, spacing=[0.1, 0.1])
+    assert main(["info", *arguments, "--json"]) == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["inside"] == 120
+    assert "42 of 120 voxels have tensors near zero, probably background, and count as inside. Pass" in captured.err
+    assert main(["info", *arguments, "--json", "--background", "outside"]) == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["inside"] == 78
+    assert captured.err == ""
+    assert main(["info", *arguments, "--json", "--background", "inside"]) == 0
+    assert capsys.readouterr().err == ""

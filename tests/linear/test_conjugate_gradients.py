@@ -47,6 +47,28 @@ def test_a_singular_matrix_is_told_however_often_it_begins_again(rng):
     assert np.isnan(x).all()
 
 
+def test_residuals_of_pure_rounding_are_no_failure(rng):
+    """Two eigenvalues: the third residual is rounding, and what the preconditioner makes of it may be negative."""
+    values, rhs = np.repeat([1.0, 3.0], 10)[:, None], rng.standard_normal((20, 2))
+    turns = 0
+
+    def precondition(r):
+        nonlocal turns
+        turns += 1
+        return -r if turns == 3 else r
+
+    def product(x):
+        return values * x, 1e-8 * (x * x).sum(axis=0)
+
+    for xp in (np, jnp):
+        turns = 0
+        x = conjugate_gradients(product, precondition, xp.asarray(rhs), xp.full(2, 1e-12)).converged
+        np.testing.assert_allclose(x, rhs / values, rtol=1e-13)
+    # A negative product of a residual that is not yet small is a failure.
+    turns = 1
+    assert np.isnan(conjugate_gradients(product, precondition, rhs, np.full(2, 1e-12)).converged).all()
+
+
 @pytest.mark.slow
 def test_rows_far_from_their_shift_converge():
     """Known eigenvectors outside of those taken out in each step grow by rounding, until they spoil the last digits."""

@@ -172,16 +172,18 @@ def test_the_command_reads_a_result_with_labels_in_space(result, capsys):
     text = (result / "explore.html").read_text(encoding="utf-8")
     about = json.loads(re.search(r'id="about">([^<]*)<', text)[1])
     assert about["labels"] == [[17, "left half"]]
-    assert about["ends"] == ["PA", "RL"]  # the first axis runs to the front, the second to the left
+    assert about["ends"] == ["LR", "PA"]  # the volume's second axis runs to the left, its first to the front
+    assert about["axes"] == {"shown": [1, 0], "first": [0, 17], "step": [1, -1]}
     medians = np.median(np.trace(tensors()[np.isfinite(signature()[0])], axis1=-2, axis2=-1)) / 2
     np.testing.assert_allclose(about["lengths"], np.sqrt(medians * TIMES), rtol=1e-5)
     assert about["world"] == [[0, -2, 5], [2, 0, -3], [0, 0, -5]]
     assert dict(about["facts"]) == {
         "grid": "24 × 18", "slice": "z = 2", "metric": "D⁻¹", "boundary": "neumann", "eigenpairs": "9",
+        "D in √(Dt)": f"{medians:.3g}, the median of the mean eigenvalues of the tensors in the domain",
     }  # fmt: skip
     inside = np.isfinite(signature()[0])
-    expected = np.broadcast_to(17 * (np.arange(24) < 12)[:, None], SHAPE)[inside]
-    np.testing.assert_array_equal(block(text, "labels", "<i4"), expected)
+    expected = np.broadcast_to(17 * (np.arange(24) < 12)[:, None], SHAPE)
+    np.testing.assert_array_equal(block(text, "labels", "<i4"), expected.T[::-1][inside.T[::-1]])
 
 
 def test_the_command_refuses_what_does_not_fit(result, tmp_path, capsys):
@@ -301,10 +303,10 @@ def test_what_noise_could_make_fades_and_points_have_bands(browser, tmp_path):
     browser.problems.clear()
     flat = signature() * (4 * np.pi * TIMES[:, None, None])
     node, other = (6, 4), (15, 6)
-    noise = np.full_like(flat, 1e-9)
-    noise[:, *node] = np.abs(flat[:, *node] - 1)  # one standard deviation from flat space
+    noise, z = 0.1 * flat, np.full_like(flat, 9.0)
+    z[:, *node] = -1
     scale = 4 * np.pi * TIMES[:, None, None]
-    path = explore(of(signature(), deviation=noise / scale), tmp_path / "noise.html")
+    path = explore(of(signature(), deviation=noise / scale, z=z), tmp_path / "noise.html")
     browser.open(path)
     browser.choose("#time", "4")
 

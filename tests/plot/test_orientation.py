@@ -325,7 +325,7 @@ def test_automatic_times_end_where_something_is_left_to_see(tmp_path, monkeypatc
     )
     field = hj.examples.torus_field((16, 16))
     np.savez(tmp_path / "t.npz", tensors=field.tensors, spacing=field.grid.spacing)
-    options = ["-k", "30", "--boundary", "neumann", "--normalisation", "flat", "-q"]
+    options = ["-k", "30", "--boundary", "periodic", "-q"]
     assert main(["hks", str(tmp_path / "t.npz"), "-o", str(tmp_path / "out"), *options, "--times", "auto:5"]) == 0
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     last = report["times"][-1]["t"]

@@ -453,6 +453,10 @@ def test_what_noise_could_make_fades_into_grey():
     grey = np.asarray(figure.axes[0].images[1].get_array())
     assert grey.shape == (2, 3, 4)
     np.testing.assert_allclose(grey[..., 3].T, [[1, 0.5], [0, 0], [0, 0]])
+    place = TensorVolume(np.broadcast_to(np.eye(2), (3, 2, 2, 2)), grid.spacing, grid.origin)
+    figure = signature_panels(Result(place, values[None], np.array([1.0]), arrays={"z": z[None]}))
+    assert "noise alone leaves 5 % of the nodes without grey" in figure.get_suptitle()
+    assert "40 % without grey" in figure.axes[0].get_title()
 
 
 def test_pictures_are_cropped_and_coloured_away_from_the_rim():
@@ -483,7 +487,7 @@ def test_pictures_of_a_signature_name_it_and_the_distance_of_diffusion(normalisa
     report = {"settings": {"metric": "inverse", "normalisation": normalisation}}
     values = np.stack([np.linspace(0.9, 1.1, 30).reshape(6, 5)] * 2)
     figure = signature_panels(Result(place, values, np.array([2.0, 8.0]), report=report))
-    assert figure.get_suptitle() == f"{title}, metric D⁻¹"
+    assert figure.get_suptitle() == f"{title}, metric D⁻¹\nD = 2 mm²/s, the median mean diffusivity"
     titles = [ax.get_title() for ax in figure.axes]
     assert titles == ["$t$ = 2 s\n$\\sqrt{Dt}$ = 2 mm", "$t$ = 8 s\n$\\sqrt{Dt}$ = 4 mm"]
 

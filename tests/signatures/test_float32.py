@@ -4,13 +4,15 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
+import scipy.sparse as sp
 from fields import random_spd
 
 import hks_jax as hj
@@ -130,3 +132,88 @@ def test_tensors_that_float32_does_not_hold_are_told(stretch):
     error = np.max(np.abs(np.asarray(rounded.eigenvalues)[known] / np.asarray(exact)[known] - 1))
     said = any("which residuals do not show" in str(each.message) for each in told)
     assert (error > 5e-4, said) == (stretch > 1e3,) * 2
+
+
+def laplacian(weights):
+    """Return the graph Laplacian of a symmetric matrix of weights, in float32."""
+    return (sp.diags(np.asarray(weights.sum(axis=1)).ravel()) - weights).tocsr().astype(np.float32)
+
+
+def chain(n, weight=1.0):
+    links = sp.diags(np.full(n - 1, weight), 1)
+    return laplacian(links + links.T)
+
+
+def cliques(bridge):
+    """Return the Laplacian of two complete graphs of 20 nodes with one link between them."""
+    weights = scipy.linalg.block_diag(*[np.ones((20, 20)) - np.eye(20)] * 2)
+    weights[19, 20] = weights[20, 19] = bridge
+    return laplacian(sp.csr_matrix(weights))
+
+
+def square(n):
+    tensors = jnp.broadcast_to(jnp.eye(2, dtype=jnp.float32), (n, n, 2, 2))
+    return hj.TensorField(hj.Grid((n, n), 1 / (n - 1)), tensors)
+
+
+def told_by(run):
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", hj.AccuracyWarning)
+        pairs = run()
+    return pairs, [str(each.message) for each in told if "cuts a multiple" not in str(each.message)]
+
+
+def test_eigenvalues_far_below_the_largest_are_accurate():
+    spectrum = 2 - 2 * np.cos(np.pi * np.arange(4) / 3000)
+    # The algebraic connectivity of two cliques of m nodes with a weak link w is 2w/m, to first order.
+    for K, exact in ((chain(3000), spectrum), (cliques(1e-5), [0, 1e-6]), (cliques(1e-8), [0, 1e-9])):
+        pairs, told = told_by(partial(hj.eigsh, K, k=len(exact)))
+        assert (not told, pairs.eigenvalues[0], pairs.result) == (True, 0, hj.RESULTS.successful)
+        np.testing.assert_allclose(pairs.eigenvalues[1:], exact[1:], rtol=2e-6)
+    stated = hj.sparse_pencil(cliques(1e-5), null_vectors=np.ones((1, 40)))
+    pairs, told = told_by(lambda: hj.eigenpairs(stated, 2))
+    assert (not told, pairs.eigenvalues[0]) == (True, 0)
+    np.testing.assert_allclose(pairs.eigenvalues[1], 1e-6, rtol=2e-6)
+
+
+@pytest.mark.parametrize(("n", "solver"), [(33, "dense"), (65, "shift-invert")])
+def test_a_small_potential_raises_the_lowest_eigenvalue(n, solver):
+    pairs, told = told_by(lambda: hj.eigenpairs(hj.assemble(square(n), potential=0.01), 4, solver=solver))
+    assert not told
+    assert pairs.eigenvalues[0] == pytest.approx(0.01, abs=1e-3)  # rounding of entries: ε ‖K‖/‖M‖
+    np.testing.assert_allclose(hj.hks(pairs, [50.0]), np.exp(-0.5), rtol=0.06)
+
+
+def test_eigenvalues_that_float32_does_not_hold_are_told():
+    pairs, (told,) = told_by(lambda: hj.eigenpairs(hj.assemble(square(33), potential=1e-5), 4))
+    assert (pairs.result, bool(pairs.uncertain[0])) == (hj.RESULTS.uncertain, True)
+    assert abs(pairs.eigenvalues[0] - 1e-5) < pairs.rounding[0] < 1e-2
+    assert told.startswith("1 of 4 eigenvalues (λ = ")
+    assert told.endswith("Use float64, or give `sparse_pencil` the null vectors")
+    # The rows of this K do not sum to zero, so nothing says that a null vector is meant.
+    K = cliques(1e-6) + 1e-6 * sp.eye(40, dtype=np.float32)
+    exact = np.linalg.eigvalsh(K.toarray().astype(float))[:2]
+    pairs, told = told_by(lambda: hj.eigsh(K, k=2))
+    assert (bool(told), pairs.uncertain.all()) == (True, True)
+    np.testing.assert_allclose(pairs.eigenvalues, exact, rtol=1e-5)
+
+
+def test_under_jit_an_eigenvalue_near_zero_has_a_code():
+    K = hj.sparse_pencil(cliques(1e-5))
+    pairs = jax.jit(lambda K: hj.eigenpairs(K, 2))(K)
+    assert pairs.result == hj.RESULTS.uncertain
+    assert (np.abs(pairs.eigenvalues - np.float32([0, 1e-6])) < pairs.rounding).all()
+    shifted = jax.jit(lambda K: hj.eigenpairs(K, 2).result)(
+        hj.sparse_pencil(K.stiffness.to_dense() + np.eye(40, dtype=np.float32))
+    )
+    assert shifted == hj.RESULTS.successful
+
+
+@pytest.mark.parametrize("boundary", ["neumann", "mean"])
+def test_eigenvalues_of_ordinary_fields_are_not_doubted(rng, boundary):
+    tensors = jnp.asarray(random_spd(rng, (16, 17), 0.5), jnp.float32)
+    field = hj.TensorField(hj.Grid((16, 17), 0.1), tensors)
+    for potential in (None, 1.0, -1.0):
+        pairs, told = told_by(lambda V=potential: hj.eigenpairs(hj.assemble(field, boundary, potential=V), 12))
+        assert (told, float(jnp.max(pairs.rounding))) == ([], 0)
+        assert (pairs.eigenvalues[0] == 0) == (potential is None)

@@ -271,7 +271,9 @@ def test_amplified_errors_give_nan(method):
     # With Dirichlet conditions the signature at t = 5 is 1e-25, far below the error.
     with pytest.warns(hj.AccuracyWarning, match="the signatures at 1 of 2 times, the first 5, are NaN"):
         found = hj.hks_spectrum_free(field, [0.2, 5.0], "dirichlet", "lumped", method)
-    exact = hj.hks(hj.eigenpairs(field, 30, "dirichlet", "dense", "lumped"), [0.2])[0]
+    # The lowest eigenvalue is 6 % too small, which makes 14 % of the signature at λt = 2.4.
+    with pytest.warns(hj.AccuracyWarning, match="between Dirichlet sides, few modes remain"):
+        exact = hj.hks(hj.eigenpairs(field, 30, "dirichlet", "dense", "lumped"), [0.2])[0]
     np.testing.assert_allclose(found[0], exact, rtol=1e-2, atol=1e-5)
     assert np.isnan(found[1, 1:-1, 1:-1]).all()
 

@@ -13,7 +13,7 @@ from benchmarks.machine import write
 
 from .harness import Tally, run, seeds
 
-KINDS = ("eigenproblems", "matrices", "gradients", "counts", "files", "spaces", "dirty", "modes", "hang")
+KINDS = ("eigenproblems", "matrices", "gradients", "counts", "estimates", "files", "spaces", "dirty", "modes", "hang")
 
 
 def main() -> int:

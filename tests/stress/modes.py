@@ -1,8 +1,10 @@
-"""Hard matrices in strict modes: `jax_debug_nans` on, and rank promotion an error.
+"""Public functions and hard matrices in strict modes: `jax_debug_nans` on, and rank promotion an error.
 
-A check takes a matrix of a kind that breaks solvers (a star, a complete graph, isolated vertices, repeated blocks, two
-scales, a zero matrix, one bulk of equal eigenvalues) or a masked field, and asks for its lowest pairs. Eigenvalues must
-be those of dense linear algebra, or be told; what JAX refuses in these modes is an error of ours.
+The first checks run one call of every public function, and compiled steps where leaks of tracers and implicit
+transfers are errors. Each further check takes a matrix of a kind that breaks solvers (a star, a complete graph,
+isolated vertices, repeated blocks, two scales, a zero matrix, one bulk of equal eigenvalues) or a masked field, and
+asks for its lowest pairs. Eigenvalues must be those of dense linear algebra, or be told; what JAX refuses in these
+modes is an error of ours.
 """
 
 import warnings
@@ -11,6 +13,7 @@ import jax
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
+from public_calls import CALLS, STEPS, run_guarded, run_strictly
 
 import hks_jax as hj
 
@@ -18,7 +21,12 @@ from .harness import Outcome
 
 
 def check(seed: int) -> Outcome:
-    """Solve a random one of these."""
+    """Run the call or the step with this number, or solve a random one of the matrices."""
+    calls = [(run_strictly, name) for name in CALLS] + [(run_guarded, name) for name in STEPS]
+    if seed < len(calls):
+        run, name = calls[seed]
+        run(name)
+        return "right"
     rng = np.random.default_rng(seed)
     with warnings.catch_warnings(record=True) as said, jax.debug_nans(True), jax.numpy_rank_promotion("raise"):
         warnings.simplefilter("always")

@@ -25,7 +25,7 @@ If a subject fails, the others are still computed. If the command is repeated, i
 tables that are missing, or whose input files have changed. A repeated command takes omitted options from the study.
 
 examples:
-  hks-jax batch subjects.tsv -o study --metric inverse --normalisation flat --atlas atlas.nii.gz
+  hks-jax batch subjects.tsv -o study --metric inverse --atlas atlas.nii.gz
   hks-jax batch subjects.tsv -o study --metric inverse --times 8e5 1.6e6 3.2e6 --only sub-07 sub-08
 """
 
@@ -35,30 +35,34 @@ import math
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from hks_jax.cli.computation import ComputationError, Settings
 from hks_jax.cli.info import describe
+from hks_jax.cli.inputs import require_inputs_kept
 from hks_jax.cli.noise import check_noise, second_scan
 from hks_jax.cli.options import FILES, READING, SOLVING, defaults, flag, options_in, refuse
 from hks_jax.cli.outputs import Done, show
 from hks_jax.cli.parsing import Times
 from hks_jax.cli.progress import Progress, StudyProgress
 from hks_jax.cli.reading import read_volume, require_metric
-from hks_jax.cli.study.folder import MAP, Study, reading_options
+from hks_jax.cli.study.folder import DESCRIPTIONS, MAP, PAIRS, REGIONS, Study, reading_options
 from hks_jax.cli.study.subjects import Subject, read_subjects
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import tuples
 from hks_jax.io.tables import read_json
 from hks_jax.io.units import LIVING_TISSUE
+from hks_jax.signatures.spans import SHORTEST
 from hks_jax.signatures.times import LAST
 
 KEPT = f"""
 @metric {READING} {SOLVING} @signature @noise
 --time-unit scanner|lambda1 = scanner
-    unit of --times: scanner, for the same t for all subjects, in seconds for D⁻¹ with D in mm²/s (default); or lambda1,
+    unit of --times: scanner, for the same t for all subjects, in seconds for D in mm²/s with the metric D⁻¹ or Fick's
+    operator (default); or lambda1,
     for the same product λ₁t, so that the given numbers are divided by each subject's first positive eigenvalue λ₁.
     Automatic times are log-spaced over the range that suits all subjects, and the study keeps them
 """
@@ -68,12 +72,17 @@ OPTIONS = f"""
 subjects SUBJECTS  the table of subjects
 -o,--output DIR!  the study's folder
 {KEPT}
-@atlas @names @view
+@atlas @names @view @rim
 --save-pairs
     save the eigenpairs of each subject, which other --times, --normalisation or --method then reuse
 --replace  replace a study in DIR that has other settings or times
 --only SUBJECT...  compute only these subjects, such as sub-07 or sub-07_ses-2
 """
+
+
+def writes(args: argparse.Namespace) -> list[Path]:
+    """Return the files that the command may write."""
+    return [args.output / name for name in (*DESCRIPTIONS, "group_*", f"**/*{MAP}*", f"**/*{REGIONS}*", f"**/*{PAIRS}")]
 
 
 def run(args: argparse.Namespace, begun: Progress) -> None:
@@ -89,6 +98,7 @@ def run(args: argparse.Namespace, begun: Progress) -> None:
     chosen = _only(subjects, args.only)
     for subject in chosen:
         if subject.arguments is not None:
+            require_inputs_kept(subject.arguments)
             require_metric(subject.arguments)
             check_noise(subject.arguments)
     if not any(s.arguments is not None and s.arguments.atlas is not None for s in subjects):
@@ -99,7 +109,8 @@ def run(args: argparse.Namespace, begun: Progress) -> None:
     with progress.catching_warnings():
         study = _open(args, subjects, progress)
         problems = {subject.name: "" for subject in subjects if subject not in chosen}
-        problems |= run_all(study, chosen, progress, args.debug)
+        outcome = run_all(study, chosen, progress, args.debug)
+        problems |= outcome.problems
         if args.only:  # other processes may have finished other subjects
             there = {s.name for s in subjects if problems.get(s.name) == "" and _is_there(study, s)}
             problems = {name: why for name, why in problems.items() if name not in there}
@@ -113,6 +124,11 @@ def run(args: argparse.Namespace, begun: Progress) -> None:
             f"{len(failed)} of {len(chosen)} subjects failed ({', '.join(failed[:5])}{', …' * (len(failed) > 5)}); "
             f"{args.output / 'group_summary.tsv'} contains the reasons. The other subjects are done. Repeat the "
             "command to compute the failed subjects again"
+        )
+    if outcome.undrawn:
+        raise ComputationError(
+            f"the results are complete, but {len(outcome.undrawn)} of {len(chosen)} pictures cannot be drawn "
+            f"({', '.join(outcome.undrawn[:5])}{', …' * (len(outcome.undrawn) > 5)}). Repeat the command to draw them"
         )
 
 
@@ -142,6 +158,14 @@ def _complete(args: argparse.Namespace) -> str:
     """Replace omitted options by options of the study in the folder or by defaults; return a note about them."""
     before = {} if args.replace else read_json(args.output / "study.json")
     kept, taken = _options(before), []
+    if args.operator == "fick":  # a given operator replaces the study's metric, and a given metric its operator
+        kept.pop("metric", None)
+    elif args.metric is not None:
+        kept.pop("operator", None)
+    for name, path in before.get("files", {}).items():
+        if getattr(args, name, "") is None:
+            setattr(args, name, Path(path))
+            taken.append(f"{flag(name)} {path}")
     # Comparable subjects need the same boundary condition, with or without a mask.
     usual = {**vars(defaults(KEPT)), "boundary": "mean"}
     for name in DEFAULTS:
@@ -159,7 +183,8 @@ def _options(record: Mapping[str, Any]) -> dict[str, Any]:
     if not record:
         return {}
     times = record["times"] if record["chosen"] == "explicit" else record["chosen"]
-    options = {"times": times, "time_unit": record["time-unit"], **record["settings"], **record["reading"]}
+    options = {"times": times, "time_unit": record["time-unit"], "operator": "laplace-beltrami"}
+    options |= {**record["settings"], **record["reading"]}
     return {name.replace("-", "_"): tuples(value) for name, value in options.items()}
 
 
@@ -173,7 +198,14 @@ def _spelled(name: str, value: Any) -> str:
 
 def _open(args: argparse.Namespace, subjects: list[Subject], progress: StudyProgress) -> Study:
     """Return the study with explicit times and write its description; raise ValueError if there is another study."""
-    study = Study(args.output, Settings.of(args), args.time_unit, reading_options(args), args.save_pairs)
+    there = [name for name in DESCRIPTIONS if (args.output / name).exists()]
+    if there and "study.json" not in there:
+        raise ValueError(
+            f"--output: got {args.output}, where another program wrote {', '.join(there)}; expected a new folder or a "
+            f"study. Choose a folder such as {args.output / 'derivatives' / 'hks-jax'}"
+        )
+    files = {name: str(getattr(args, name).absolute()) for name in FILES if getattr(args, name) is not None}
+    study = Study(args.output, Settings.of(args), args.time_unit, reading_options(args), args.save_pairs, files)
     times = study.settings.times
     before, chosen = read_json(args.output / "study.json"), "explicit" if times.explicit else f"auto:{times.automatic}"
     now, then = _options({**study.record, "chosen": chosen}), _options(before)
@@ -198,7 +230,7 @@ def _suitable(
 ) -> tuple[float, ...]:
     """Read all subjects, and return times that suit them; ignore subjects that cannot be read."""
     if args.metric == "adjugate":
-        raise ValueError("--times: automatic times in a study need the metric inverse or tensor. Choose the times")
+        raise ValueError("--times: automatic times in a study need inverse, tensor or --operator fick. Choose times")
     ranges: dict[str, Range] = {}
     first = ""
     silent = StudyProgress(1, True, io.StringIO())  # warnings are shown when the subject is computed
@@ -215,33 +247,46 @@ def _suitable(
     return times
 
 
-Range = tuple[float, float]
-"""A subject's least time (by voxel size and number of eigenpairs) and largest time (by the domain's size)."""
+class Range(NamedTuple):
+    """The times that suit a subject.
+
+    Attributes:
+        least: the least time by the voxel size and the number of eigenpairs.
+        free: the time at which half of the voxels are free of the boundary.
+        largest: the largest time by the domain's size, at which λ₁t is `LAST`.
+    """
+
+    least: float
+    free: float
+    largest: float
 
 
 def suitable_range(volume: TensorVolume, args: argparse.Namespace) -> Range:
     """Estimate the range of times that suits a subject from its metric and its size, without eigenpairs."""
-    of: dict[str, Any] = describe(args.file, volume, args.boundary)["suits"][args.metric or "tensor"]
+    metric = "inverse" if args.operator == "fick" else args.metric or "tensor"
+    of: dict[str, Any] = describe(args.file, volume, args.boundary)["suits"][metric]
     by_pairs = of["least_time_of_k"] * (1.0 if args.k is None else of["k"] / args.k) ** (2 / volume.dimension)
-    return max(of["least_time"], by_pairs), of["largest_time"]
+    return Range(max(of["least_time"], by_pairs), of["largest_time"], of["time_by_size"])
 
 
 def common_times(ranges: Mapping[str, Range], n: int, unit: str) -> tuple[float, ...]:
-    """Return n log-spaced times in the intersection of all subjects' ranges, rounded to three digits.
+    """Return n log-spaced times, rounded to three digits, from the first time that is resolved for all subjects.
 
-    For the unit ``"lambda1"``, the function returns products λ₁t; the largest product is `LAST`.
+    The last time is the least time at which half of a subject's voxels are free of the boundary, but at least twice the
+    first time. For the unit ``"lambda1"``, the function returns products λ₁t.
     """
     if unit == "lambda1":
-        ranges = {name: (LAST * least / most, LAST) for name, (least, most) in ranges.items()}
-    late, small = max(ranges, key=lambda s: ranges[s][0]), min(ranges, key=lambda s: ranges[s][1])
-    least, largest = ranges[late][0], ranges[small][1]
+        ranges = {name: Range(*(LAST * t / one.largest for t in one)) for name, one in ranges.items()}
+    late, small = max(ranges, key=lambda s: ranges[s].least), min(ranges, key=lambda s: ranges[s].largest)
+    least, largest = ranges[late].least, ranges[small].largest
     if least >= largest:
         raise ValueError(
             f"--times: no time suits all subjects: {late} resolves only t ≥ {least:.3g}, and the size of {small} "
             f"allows only t ≤ {largest:.3g}. Choose times, or more eigenpairs (-k). See 'hks-jax info' for {late}: "
             "tensors with eigenvalues near zero need many eigenpairs (--repair nearest:1e-4)"
         )
-    return tuple(float(f"{t:.3g}") for t in np.geomspace(least, largest, n))
+    end = min(largest, max(min(one.free for one in ranges.values()), SHORTEST * least))
+    return tuple(float(f"{t:.3g}") for t in np.geomspace(least, end, n))
 
 
 def _only(subjects: list[Subject], names: list[str] | None) -> list[Subject]:

@@ -6,20 +6,20 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from hks_jax import __version__
 from hks_jax.cli.computation import Settings
+from hks_jax.cli.inputs import tensor_files
 from hks_jax.cli.noise import second_scan
 from hks_jax.cli.options import COLUMNS
 from hks_jax.cli.parsing import Times
 from hks_jax.cli.study.subjects import Subject
 from hks_jax.io.formats import format_of
 from hks_jax.io.masks import names_beside
-from hks_jax.io.nifti import is_nifti, siblings, sidecar_of
 from hks_jax.io.result import Result, plain
 from hks_jax.io.tables import read_json, read_table, write_json, write_table
 from hks_jax.io.volume import digest
@@ -29,6 +29,8 @@ MAP = "_model-tensor_param-hks_dwimap"
 REGIONS = "_model-tensor_param-hks_regions"
 PAIRS = "_model-tensor_param-hks_pairs.npz"
 """The suffixes of file names: a subject's signature, the table of its regions, and its saved eigenpairs."""
+DESCRIPTIONS = ("study.json", "dataset_description.json", ".bidsignore", "participants.tsv")
+"""The names of the files that describe a study."""
 _SUFFIXES = {MAP: ".npz", REGIONS: ".tsv"}
 GENERATED_BY = {"Name": "hks-jax", "Version": __version__}
 _TEMPORARY = re.compile(r"\.[0-9a-f]{12}\..+")
@@ -37,8 +39,9 @@ SUMMARY = {
     "status": "done, failed, or pending if the run did not include the subject",
     "voxels": "number of voxels in the domain",
     "k": "number of eigenpairs",
-    "lambda1": "first positive eigenvalue in 1/(metric length)²; in 1/s for the metric D⁻¹ with D in mm²/s",
+    "lambda1": "first positive eigenvalue in 1/(metric length)²; in 1/s for D in mm²/s with D⁻¹ or Fick's operator",
     "truncation": "largest share of the signature, over t, from omitted eigenpairs (estimate)",
+    "free_of_rim": "share of voxels, at the last t, at which the boundary contributes less than 10 % of the signature",
     "resolution": "largest relative error, over t, due to the size of the voxels (estimate)",
     "warnings": "number of warnings, which the subject's sidecar contains",
     "problem": "reason why the subject failed",
@@ -56,6 +59,7 @@ class Study:
         time_unit: ``"scanner"``, or ``"lambda1"`` if the times are products λ₁t.
         reading: the options for reading, which rows of the table may replace.
         save_pairs: whether the eigenpairs are saved.
+        files: the paths of files for all subjects, by name of the option, which a repeated command takes.
     """
 
     folder: Path
@@ -63,14 +67,19 @@ class Study:
     time_unit: str
     reading: Mapping[str, Any]
     save_pairs: bool = False
+    files: Mapping[str, str] = field(default_factory=dict)
 
     def path(self, subject: Subject, ending: str, folder: str = "dwi") -> Path:
         """Return the path of a subject's file."""
         return self.folder / subject.folder / folder / f"{subject.name}{ending}"
 
+    def picture(self, subject: Subject) -> Path:
+        """Return the path of the picture of a subject's signature."""
+        return self.path(subject, f"{MAP}.png", "figures")
+
     def fingerprint(self, subject: Subject) -> str:
         """Return a digest of all inputs of a subject's signature; raise FileNotFoundError if a file is missing."""
-        reading, inputs = reading_options(subject.args), _inputs(subject.args)
+        reading, inputs = reading_options(subject.args), tensor_files(subject.args)
         files = {role: [digest(existing(path)) for path in paths] for role, paths in inputs.items()}
         return _digest({"settings": asdict(self.settings), "unit": self.time_unit, "reading": reading, "files": files})
 
@@ -92,24 +101,22 @@ class Study:
         made_of = read_json(self.path(subject, f"{kind}.json")).get("Fingerprint")
         return made_of == fingerprint and self.path(subject, kind + _SUFFIXES[kind]).is_file()
 
-    def write_signature(
-        self, subject: Subject, fingerprint: str, result: Result, warnings: list[str], draw: Callable[[Path], Any]
-    ) -> None:
-        """Write a subject's signature, its picture and, last, the sidecar that marks completion, all without dates."""
+    def write_signature(self, subject: Subject, fingerprint: str, result: Result, warnings: list[str]) -> None:
+        """Write a subject's signature and, last, the sidecar that marks completion, all without dates."""
         self.forget(subject)
         args, report, scaled = subject.args, result.report, result.arrays.get("scaled_times")
         target = self.path(subject, MAP)
         with atomic_folder(target.parent) as temporary:
             result.save(temporary / target.name, format_of(args.file).image)
-        with atomic_path(self.path(subject, f"{MAP}.png", "figures")) as picture:
-            draw(picture)
         sidecar = {
             "Description": "Heat kernel signature of the field of diffusion tensors; times along the last axis",
             "Model": {"Description": "Diffusion tensor", "Parameters": report["settings"]},
             "Times": result.times.tolist(),
             "TimesByFirstEigenvalue": None if scaled is None else scaled.tolist(),
             "TimesDescription": times_text(self.time_unit),
-            "Sources": [os.path.basename(path) for paths in _inputs(args).values() for path in paths],
+            "Units": report["units"],
+            "Rim": report["rim"],
+            "Sources": [os.path.basename(path) for paths in tensor_files(args).values() for path in paths],
             "Input": _without_folder(report["input"]),
             "Eigenpairs": report["eigenpairs"],
             "Truncation": report["times"],
@@ -123,7 +130,7 @@ class Study:
 
     def forget(self, subject: Subject) -> None:
         """Remove files of a subject from an interrupted run or from a run with other settings."""
-        sidecar, picture = self.path(subject, f"{MAP}.json"), self.path(subject, f"{MAP}.png", "figures")
+        sidecar, picture = self.path(subject, f"{MAP}.json"), self.picture(subject)
         sidecar.unlink(missing_ok=True)  # first, because a sidecar means that the other files are complete
         ours = [file for kind in _SUFFIXES for file in sidecar.parent.glob(f"{subject.name}{kind}.*")]
         for path in [*ours, picture, sidecar.with_name("explore.html")]:
@@ -161,7 +168,7 @@ class Study:
         write_json(self.folder / "dataset_description.json", description)
         with atomic_path(self.folder / ".bidsignore") as temporary:
             temporary.write_text("study.json\ngroup_*\n*.npz\n*_regions.*\n")
-        about = {**self.record, "chosen": chosen, "description": times_text(self.time_unit)}
+        about = {**self.record, "chosen": chosen, "files": self.files, "description": times_text(self.time_unit)}
         write_json(self.folder / "study.json", about)
         covariates = list(dict.fromkeys(name for subject in subjects for name in subject.covariates))
         first = {subject.participant: subject.covariates for subject in reversed(subjects)}  # of the first session
@@ -204,7 +211,7 @@ def times_text(unit: str) -> str:
     """Return a description of the times of a study."""
     if unit == "lambda1":
         return "the times of each subject are the given numbers divided by its first positive eigenvalue λ₁"
-    return "all subjects have the same times, in (metric length)²; in s for the metric D⁻¹ with D in mm²/s"
+    return "all subjects have the same times, in (metric length)²; in s for D in mm²/s with D⁻¹ or Fick's operator"
 
 
 def _without_folder(about: Mapping[str, Any]) -> dict[str, Any]:
@@ -214,24 +221,12 @@ def _without_folder(about: Mapping[str, Any]) -> dict[str, Any]:
 def _summary(sidecar: Path, problem: str | None) -> tuple[Any, ...]:
     report = {} if problem is not None else read_json(sidecar)
     if not report:
-        return ("failed" if problem else "pending", *(None,) * 6, problem or None)
+        return ("failed" if problem else "pending", *(None,) * 7, problem or None)
     pairs, times = report["Eigenpairs"], report["Truncation"]
     worst = [max((t[name] or 0.0 for t in times), default=0.0) for name in ("truncation", "resolution_bias")]
     inside, warnings = report["Input"]["voxels_inside"], len(report["Warnings"])
-    return ("done", inside, pairs["k"], pairs["first_positive"], *worst, warnings, None)
-
-
-def _inputs(args: argparse.Namespace) -> dict[str, list[str]]:
-    """Return the input files of a subject's signature, grouped by role."""
-    images = [args.file, *args.others]
-    if not args.others and args.bval is None:
-        images = siblings(args.file)
-    sidecar = sidecar_of(images[0]) if args.bval is None and is_nifti(images[0]) else None
-    sidecars = [] if sidecar is None or not sidecar.is_file() else [sidecar]
-    given = {"file": images, "sidecar": sidecars, "mask": [args.mask], "bval": [args.bval], "bvec": [args.bvec]}
-    inputs = {role: [str(path) for path in paths if path is not None] for role, paths in given.items()}
-    second = second_scan(args)
-    return inputs if second is None else {**inputs, "noise": [*_inputs(second)["file"], *_inputs(second)["sidecar"]]}
+    free = times[-1].get("free_of_rim") if times else None
+    return ("done", inside, pairs["k"], pairs["first_positive"], worst[0], free, worst[1], warnings, None)
 
 
 def _digest(content: Any) -> str:

@@ -15,6 +15,7 @@ import numpy as np
 from hks_jax.cli import INPUT_ERRORS
 from hks_jax.cli.computation import ComputationError, Solved, compute_pairs
 from hks_jax.cli.noise import noise_of_volume, signature_of
+from hks_jax.cli.outputs import PictureError, draw_picture
 from hks_jax.cli.pairs import are_of, read_pairs, write_pairs
 from hks_jax.cli.parsing import Times
 from hks_jax.cli.progress import StudyProgress
@@ -23,6 +24,7 @@ from hks_jax.cli.stats import region_table
 from hks_jax.cli.study.folder import MAP, PAIRS, REGIONS, Study
 from hks_jax.cli.study.subjects import Subject
 from hks_jax.io.formats import format_of
+from hks_jax.io.result import Result
 from hks_jax.io.tables import write_table
 from hks_jax.plot import signature_panels
 from hks_jax.signatures.times import positive_range
@@ -31,17 +33,26 @@ from hks_jax.storage import claim
 FORGETFUL = 8
 """The number of subjects after which compiled programs are deleted; each domain needs 70 MiB of new programs."""
 
+PICTURE = "picture"
+
 PATIENCE = 0.5
 """The seconds between two checks of subjects that other processes compute."""
 
 
-def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debug: bool) -> dict[str, str]:
-    """Compute all subjects that are not done; return the error messages of failed subjects by name.
+class Outcome(NamedTuple):
+    """The error messages of failed subjects by name, and the names of subjects without a picture."""
+
+    problems: dict[str, str]
+    undrawn: list[str]
+
+
+def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debug: bool) -> Outcome:
+    """Compute all subjects that are not done.
 
     Several processes may work on the same study; the first process that starts a subject computes it. If another
     process restarts the study with other settings, this function raises ValueError.
     """
-    problems = dict[str, str]()
+    problems, undrawn = dict[str, str](), list[str]()
 
     def failed(subject: Subject, error: Exception) -> None:
         if debug:
@@ -80,6 +91,9 @@ def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debu
                         number += 1
                         with progress.subject(task.subject.name):
                             task.run(progress)
+            except PictureError as error:
+                undrawn.append(task.subject.name)
+                progress.end(f"{task.subject.name}: {error}")
             except Exception as error:
                 failed(task.subject, error)
         if len(elsewhere) == len(pending):
@@ -89,7 +103,7 @@ def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debu
             time.sleep(PATIENCE)
         pending = elsewhere
     progress.end(f"{len(subjects) - len(problems)} of {len(subjects)} subjects are done")
-    return problems
+    return Outcome(problems, undrawn)
 
 
 class _Task(NamedTuple):
@@ -107,14 +121,16 @@ class _Task(NamedTuple):
 
     @property
     def missing(self) -> list[str]:
-        """The results, `MAP` or `REGIONS`, that do not exist or have another fingerprint."""
+        """The results, `MAP` or `REGIONS`, that do not exist or have another fingerprint, and a missing `PICTURE`."""
         wanted = {MAP: self.fingerprint} | ({REGIONS: self.regions} if self.regions else {})
-        return [kind for kind, fingerprint in wanted.items() if not self.study.has(self.subject, kind, fingerprint)]
+        lacking = [kind for kind, fingerprint in wanted.items() if not self.study.has(self.subject, kind, fingerprint)]
+        return lacking if self.study.picture(self.subject).is_file() else [*lacking, PICTURE]
 
     def run(self, progress: StudyProgress) -> None:
-        study, subject = self.study, self.subject
+        """Compute what is missing; draw the picture last, so that a failure leaves the results."""
+        study, subject, result = self.study, self.subject, None
         if MAP in self.missing:
-            _compute(study, subject, self.fingerprint, progress)  # removes the table of regions
+            result = _compute(study, subject, self.fingerprint, progress)  # removes the picture and table of regions
         if REGIONS in self.missing:
             table = study.path(subject, f"{REGIONS}.tsv")
             for old in (table.with_suffix(".json"), table):  # the sidecar first, because it marks completion
@@ -123,9 +139,15 @@ class _Task(NamedTuple):
                 source, args = study.path(subject, f"{MAP}.npz"), subject.args
                 columns, rows, about = region_table(source, args.atlas, args.names, progress)
                 write_table(table, columns, rows, {**about, "Fingerprint": self.regions})
+        if PICTURE in self.missing:
+            npz = study.path(subject, f"{MAP}.npz")
+            result = Result.read(npz, "hks", over_times=True) if result is None else result
+            with progress.stage("drawing"):
+                style = {"view": subject.args.view, "show_rim": subject.args.show_rim}
+                draw_picture(study.picture(subject), partial(signature_panels, result, **style), [npz])
 
 
-def _compute(study: Study, subject: Subject, fingerprint: str, progress: StudyProgress) -> None:
+def _compute(study: Study, subject: Subject, fingerprint: str, progress: StudyProgress) -> Result:
     study.forget(subject)
     args, solved = subject.args, _pairs(study, subject, progress)
     scaled: dict[str, np.ndarray] = {}
@@ -139,9 +161,9 @@ def _compute(study: Study, subject: Subject, fingerprint: str, progress: StudyPr
     noise = noise_of_volume(args, solved.volume, solved.field.grid, progress)
     result = signature_of(args, solved, noise, progress)
     result = replace(result, arrays={**scaled, **result.arrays})
-    drawing = partial(signature_panels, result, view=args.view)
     with progress.stage("writing"):
-        study.write_signature(subject, fingerprint, result, progress.warnings, drawing)
+        study.write_signature(subject, fingerprint, result, progress.warnings)
+    return result
 
 
 def _pairs(study: Study, subject: Subject, progress: StudyProgress) -> Solved:

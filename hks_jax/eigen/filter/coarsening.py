@@ -35,7 +35,8 @@ def coarsen(fine: NodalPencil) -> NodalPencil:
     for axis, (own, count) in enumerate(zip(along, counts, strict=True)):
         colours = colours * count + jnp.expand_dims(own, [other for other in range(len(shape)) if other != axis])
     of_neighbour = jnp.stack([*neighbours(with_rim(colours + 1, fine.periodic), len(shape))]).astype(jnp.int32) - 1
-    indicators = (colours.ravel() == np.arange(padded, dtype=np.float32)[:, None]).reshape(-1, _COLUMNS, colours.size)
+    indicators = colours.ravel()[None] == np.arange(padded, dtype=np.float32)[:, None]
+    indicators = indicators.reshape(-1, _COLUMNS, colours.size)
     indicators, of_neighbour = jax.lax.optimization_barrier((indicators, of_neighbour))
 
     def images(rows: Bool[Array, "b coarse"]) -> tuple[Float[Array, "b coarse"], ...]:

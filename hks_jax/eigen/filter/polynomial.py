@@ -86,7 +86,8 @@ def correction(
     reference = jnp.minimum(value, band.low)
 
     def run(inverse: Callable[[Array], Array]) -> Columns:
-        w = inverse(residual / pencil.lumped[..., None].astype(dtype)) - aligned(reference.astype(dtype), whole) * whole
+        w = inverse(residual / pencil.lumped[..., None].astype(dtype))
+        w = w - aligned(reference.astype(dtype), residual) * whole
         return chebyshev_iteration(lambda z: inverse(stiffness(z)), w, band.low, band.high, reference, degree)
 
     # The case ``terms`` = 0 is compiled separately, so that XLA fuses a whole step of the Chebyshev iteration.

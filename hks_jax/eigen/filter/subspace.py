@@ -22,7 +22,7 @@ from hks_jax.fem.nodal import NodalPencil, to_columns
 from hks_jax.linear.accelerators import row_by_row
 from hks_jax.linear.dense_eigh import pencil_eigh
 from hks_jax.linear.loops import by_column_ranges
-from hks_jax.linear.products import matmul
+from hks_jax.linear.products import aligned, matmul
 
 EVERYWHERE = PartitionSpec()
 _CHUNK = 1 << 14
@@ -98,7 +98,8 @@ def measured(pencil: NodalPencil, slabs: Slabs | None, block: int, values: Value
         columns = block_of(x, number, block, pencil.shape)
         theta = jax.lax.dynamic_slice_in_dim(values, number * block, block)
         image, moved = products(columns)
-        terms = (image - theta * moved) ** 2, moved**2, columns * image, pencil.lumped[..., None] * columns**2
+        apart = image - aligned(theta, moved) * moved
+        terms = apart**2, moved**2, columns * image, pencil.lumped[..., None] * columns**2
         return tuple(jnp.sum(term, tuple(range(columns.ndim - 1))) for term in terms)
 
     sums = jax.lax.map(of_block, jnp.arange(values.size // block))

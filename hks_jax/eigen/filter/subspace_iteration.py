@@ -20,6 +20,7 @@ from hks_jax.fem.halo import Slabs
 from hks_jax.fem.nodal import NodalPencil, to_columns, to_rows
 from hks_jax.linear.accelerators import row_by_row
 from hks_jax.linear.loops import for_each
+from hks_jax.linear.products import aligned
 
 _GAIN = 40.0
 """The factor by which one round damps unwanted modes. The error of the lumped mass would dominate a larger factor."""
@@ -189,12 +190,12 @@ class GridFilter(eqx.Module):
                 jax.lax.dynamic_slice_in_dim(v, number * block, block) for v in (values, chosen.values, chosen.factor)
             )
             # If the quotient ζ of x is in the damped band, the residual is large, and the polynomial is applied to x.
-            inside = zeta > band.low
+            inside = aligned(zeta > band.low, x)
             image, moved = products(x)
-            residual = image - jnp.where(inside, 0, theta * moved)
+            residual = image - jnp.where(inside, 0, aligned(theta, x) * moved)
             whole = jnp.where(inside, x, 0).astype(jnp.float32)
             z = correction(pencil, band, residual.astype(jnp.float32), zeta, degree, whole, chosen.terms)
-            z = jnp.where(inside, 1, jnp.clip(scale, 0, 1)) * z.astype(x.dtype)
+            z = jnp.where(inside, 1, aligned(jnp.clip(scale, 0, 1), x)) * z.astype(x.dtype)
             return rows + row_by_row(to_rows(z))
 
         # `cond` gets only the block, because XLA copies the operands of a condition.

@@ -160,7 +160,7 @@ def _inverse_iteration(
     values, mix = lapack.eigh(gram(x, stiffness(x)))
     x = matmul(x, mix)
     image = mass(x)
-    return values, x, jnp.linalg.norm(stiffness(x) - values * image, axis=0) / jnp.linalg.norm(image, axis=0)
+    return values, x, jnp.linalg.norm(stiffness(x) - values[None] * image, axis=0) / jnp.linalg.norm(image, axis=0)
 
 
 @jit_quickly(static_argnames=("plan", "rows"))

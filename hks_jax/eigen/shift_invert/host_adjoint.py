@@ -48,19 +48,19 @@ class HostAdjoint(Adjoint[Pencil]):
         """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`."""
         data, matrices = host_matrices(pencil)
         tolerance = complement.attainable(self.tolerance, rhs.dtype)
+        n_data, result = len(data), jax.ShapeDtypeStruct(rhs.shape, rhs.dtype)
 
-        def on_host(data_k: ArrayLike, data_m: ArrayLike, nulls: ArrayLike, *arrays: ArrayLike) -> np.ndarray:
-            values, vectors, b = (np.asarray(array, np.float64) for array in arrays)
+        def on_host(*inputs: ArrayLike) -> np.ndarray:
+            values, vectors, b = (np.asarray(array, np.float64) for array in inputs[n_data:])
             if not all(np.isfinite(array).all() for array in (values, vectors, b)):
-                return np.full(rhs.shape, np.nan, rhs.dtype)
-            K, M = matrices(data_k, data_m, nulls)
-            return _solve(K, M, values, vectors, b, tolerance, rhs.dtype).astype(rhs.dtype)
+                return np.full(result.shape, np.nan, result.dtype)
+            K, M = matrices(*inputs[:n_data])
+            return _solve(K, M, values, vectors, b, tolerance, result.dtype).astype(result.dtype)
 
         inputs = *data, values, vectors, rhs
         if not is_traced(inputs):
             return jax.device_put(on_host(*inputs))
-        shape = jax.ShapeDtypeStruct(rhs.shape, rhs.dtype)
-        return jax.pure_callback(on_host, shape, *inputs, vmap_method="sequential")
+        return jax.pure_callback(on_host, result, *inputs, vmap_method="sequential")
 
 
 def _solve(

@@ -2,16 +2,20 @@
 
 from collections.abc import Callable
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array
+from jaxtyping import Array, Float
 from scipy.sparse import coo_matrix, csc_matrix, diags
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu
 
 from hks_jax.linear.multifrontal import CONTRACTION
 from hks_jax.linear.operators import Places
 from hks_jax.linear.pencil import SymmetricPencil
+
+_EXACT = 1e-13
+"""The sum of a row of K, relative to the sizes of the entries, up to which the sum is zero in double precision."""
 
 
 def factorise_on_host(matrix: csc_matrix) -> SuperLU:
@@ -37,23 +41,67 @@ def inertia_on_host(K: csc_matrix, M: csc_matrix, shift: float) -> tuple[int, bo
 
 
 def host_matrices(pencil: SymmetricPencil) -> tuple[tuple[Array, ...], Callable[..., tuple[csc_matrix, csc_matrix]]]:
-    """Return arrays of K, M and the null vectors of K, and a function that makes SciPy matrices from such arrays.
+    """Return the arrays of a pencil, and a function that makes the SciPy matrices K and M from such arrays.
 
-    The matrices are float64. For a null vector v, rounding errors in Kv would act as a potential. If each node belongs
-    to exactly one null vector, the rounding errors in Kv are subtracted from the diagonal of K.
+    The matrices are float64, and K is that before rounding (`Unrounded`). For a null vector v, rounding errors in Kv
+    would act as a potential. If no node belongs to two null vectors, the rounding errors in Kv are subtracted from the
+    diagonal of K.
     """
-    (data_k, pattern_k), (data_m, pattern_m) = pencil.stiffness.triplets(), pencil.mass.triplets()
-    n = pencil.size
-    nulls = jnp.zeros((0, n), data_k.dtype) if pencil.null_space is None else pencil.null_space.vectors
+    source, n = pencil.unrounded, pencil.size
+    (data_k, pattern_k), (data_m, pattern_m) = source.stiffness.triplets(), pencil.mass.triplets()
 
-    def matrices(data_k: ArrayLike, data_m: ArrayLike, nulls: ArrayLike) -> tuple[csc_matrix, csc_matrix]:
+    def matrices(
+        data_k: ArrayLike, origin: ArrayLike, data_m: ArrayLike, nulls: ArrayLike
+    ) -> tuple[csc_matrix, csc_matrix]:
         K, M, vectors = _csc(data_k, pattern_k, n), _csc(data_m, pattern_m, n), np.asarray(nulls, np.float64)
-        if ((vectors != 0).sum(axis=0) == 1).all():
+        if ((vectors != 0).sum(axis=0) <= 1).all():
             vector = vectors.sum(axis=0)
-            K = K - diags((K @ vector) / vector)
-        return K, M
+            K = K - diags(np.where(vector != 0, (K @ vector) / np.where(vector != 0, vector, 1), 0))
+        shift = float(np.asarray(origin))
+        return K - shift * M if shift else K, M
 
-    return (data_k, data_m, nulls), matrices
+    return (data_k, source.origin, data_m, source.null_vectors), matrices
+
+
+def balanced(pencil: SymmetricPencil) -> Float[Array, "1 n_dof"]:
+    """Return 1 on the components of the matrix K whose rows sum to zero within rounding, and 0 elsewhere.
+
+    Each sum is compared with the effect of rounding on the row's entries. Rounding errors of different rows cancel in
+    the sum of all entries, so its limit is less than the sum of the limits. A constant on the diagonal
+    exceeds it.
+    """
+    (data, pattern), n, eps = pencil.stiffness.triplets(), pencil.size, np.finfo(pencil.stiffness.dtype).eps
+    K = _csc(data, pattern, n)
+    K.eliminate_zeros()
+    number, label = connected_components(K, directed=False)
+    sums, limits = K @ np.ones(n), eps * (abs(K) @ np.ones(n))
+    total, limit = np.abs(np.bincount(label, sums, number)), np.sqrt(np.bincount(label, limits**2, number))
+    balance = (np.bincount(label, np.abs(sums) > limits, number) == 0) & (total <= limit)
+    return jax.device_put(balance[label][None].astype(pencil.stiffness.dtype))
+
+
+def near_zero(
+    pencil: SymmetricPencil, vectors: Float[np.ndarray, "m n_dof"], accurate: bool
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """Return float64 Rayleigh quotients of K, not of K − σM, and their changes by rounding of the entries of K.
+
+    Unless the vectors are ``accurate``, the changes include the effect of rounding on the null vectors of K.
+    """
+    source, columns = pencil.unrounded, vectors.T.astype(np.float64)
+    data, matrices = host_matrices(pencil)
+    K, M = matrices(data[0], 0.0, *data[2:])
+    # If all entries Kᵢⱼ are rounded and wᵢ are the sums of rows, the changes of Kᵢⱼ and wᵢ change the quadratic form
+    #
+    #     φᵀKφ = −Σ_{i<j} Kᵢⱼ (φᵢ − φⱼ)² + Σᵢ wᵢφᵢ².
+    #
+    # A sum wᵢ that is known to be zero, because K annihilates constants, does not change.
+    sizes, sums = abs(K), K @ np.ones(pencil.size)
+    limits = sizes @ np.ones(pencil.size)
+    known = np.abs(sums) <= _EXACT * limits if accurate else np.zeros(pencil.size, bool)
+    changes = np.where(known, limits, 2 * limits) @ columns**2 - np.sum(columns * (sizes @ columns), axis=0)
+    squares = np.sum(columns * (M @ columns), axis=0)
+    rounding = np.finfo(source.stiffness.dtype).eps * changes / squares
+    return np.sum(columns * (K @ columns), axis=0) / squares, rounding
 
 
 def _csc(data: ArrayLike, pattern: Places, n: int) -> csc_matrix:

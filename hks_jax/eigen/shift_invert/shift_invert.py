@@ -15,6 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from hks_jax.checks import require_count
 from hks_jax.eigen.adjoints.adjoint import Adjoint
+from hks_jax.eigen.quality import largest_of
 from hks_jax.eigen.shift_invert.host_adjoint import HostAdjoint
 from hks_jax.eigen.shift_invert.matrices import factorise_on_host, host_matrices, inertia_on_host
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, Status, silent
@@ -25,6 +26,8 @@ HostPairs = tuple[np.ndarray, np.ndarray, float]
 
 _ROUNDS = 20
 """The maximal number of ARPACK runs. Each run of ARPACK after the first searches for missed eigenvalues."""
+_BESIDE = 1e-6
+"""The distance of a count of eigenvalues below the last computed one, relative to the range of the computed ones."""
 _TOLD = 25
 """The number of solves between two reports."""
 
@@ -49,6 +52,7 @@ class ShiftInvert(Eigensolver[Pencil]):
 
     name: ClassVar[str] = "shift-invert"
     indefinite: ClassVar[bool] = False
+    in_double: ClassVar[bool] = True
     tolerance: float = eqx.field(default=1e-8, static=True)
     max_restarts: int = eqx.field(default=300, static=True)
     basis: int | None = eqx.field(default=None, static=True)
@@ -93,6 +97,7 @@ class ShiftInvert(Eigensolver[Pencil]):
             return nothing
         report("factorising")
         begun = time.perf_counter()
+        rounding = 4 * np.finfo(float).eps * float(largest_of(np, K, M))
         factor = factorise_on_host(K + shift * M)
         factorised = time.perf_counter()
         values, vectors = np.empty(0), np.empty((n, 0))
@@ -129,10 +134,16 @@ class ShiftInvert(Eigensolver[Pencil]):
             # Lanczos with single vectors can miss pairs of a multiple eigenvalue. By Sylvester's law of inertia, the
             # negative pivots of K − σM count the eigenvalues below σ. If pairs are missing, search orthogonally to
             # known pairs.
-            below = values[-1] - 1e-6 * max(values[-1], shift)
-            if below <= 0:  # only null vectors
-                return _padded(values, vectors, k, max(below, 0.0))
-            negative, sound = inertia_on_host(K, M, below)
+            # The count is just below the last value. If all values are copies of the lowest eigenvalue, the distance is
+            # just above their rounding errors; if the factorisation is too inaccurate there, the distance is larger.
+            near = max(_BESIDE * (values[-1] - values[0]), 4 * rounding)
+            for distance in (near, _BESIDE * max(values[-1], shift)):
+                below = values[-1] - distance
+                if below <= 0:  # only null vectors
+                    return _padded(values, vectors, k, max(below, 0.0))
+                negative, sound = inertia_on_host(K, M, below)
+                if sound:
+                    break
             missing = negative - int((values < below).sum())
             if not sound or missing <= 0:
                 return _padded(values, vectors, k, below if sound else np.nan)

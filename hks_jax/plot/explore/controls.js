@@ -39,14 +39,20 @@ function planeOf() {
 const REGIONS = ["none", "a lasso on an image", "points similar to A"];
 
 function setUp() {
+  const named = (axis) => AXES[axisOfVolume(axis)];
   element("title").textContent = about.title;
   element("facts").textContent = about.facts.map(([name, value]) => `${name}: ${value}`).join(" · ");
   element("software").textContent = about.software;
-  element("reading").textContent = isFlat
+  element("reading").textContent = isFlat && about.fick
+    ? `${power}·HKS of Fick's operator div(D∇u) is 1 where D is constant and no boundary is near. At small t it is above 1 ` +
+      "where less can flow away than with the local D, and below 1 where more can. Neumann (natural) boundaries raise it nearby. " +
+      "At large t heat is uniform in space; HKS / mean then shows the differences."
+    : isFlat
     ? `${power}·HKS is 1 where space is flat and no boundary is near. At small t it is above 1 where the curvature is positive, ` +
       "below 1 where it is negative. Neumann (natural) boundaries raise it nearby, up to twofold along a straight side. " +
-      "Dirichlet boundaries lower it to 0. The mean of both has nearly no boundary effect. At large t it grows everywhere, because heat has filled the domain; " +
-      "HKS / mean then shows the differences."
+      "Dirichlet boundaries lower it to 0. The mean of both cancels the effect of a straight boundary of a flat domain, but not that of its bends and " +
+      "corners: beside a round boundary it is above 1. At large t every node feels the boundary, and it grows everywhere because heat has filled " +
+      "the domain; then it shows the domain's shape and not curvature."
     : "This signature is normalised, so only its differences between places are meaningful.";
   element("time").max = element("from").max = element("to").max = farthest;
   element("time").value = state.time;
@@ -56,7 +62,9 @@ function setUp() {
   for (const row of document.querySelectorAll(".volume")) row.hidden = dimension === 2;
   for (const row of document.querySelectorAll(".surface")) row.hidden = !surface;
   for (const row of document.querySelectorAll(".noise")) row.hidden = !deviations;
-  options(element("plane"), AXES.map((name, a) => `across ${name} (${AXES.filter((_, b) => b !== a).join(", ")})`));
+  for (const row of document.querySelectorAll(".fades")) row.hidden = !scores;
+  for (const row of document.querySelectorAll(".rim")) row.hidden = !near;
+  options(element("plane"), AXES.map((_, a) => `across ${named(a)} (${[0, 1, 2].filter((b) => b !== a).map(named).join(", ")})`));
   options(element("quantity"), quantities.map((q) => q.name));
   options(element("layer-name"), layers.map((layer) => layer.name));
   options(element("region"), [...REGIONS, ...about.labels.map(([, name]) => name)]);
@@ -77,6 +85,7 @@ function setUp() {
   onInput("quantity", (input) => (state.quantity = quantities[input.value]));
   onInput("contrast", () => {});
   onInput("same", () => {});
+  onInput("rim", () => {});
   onInput("fade", () => {});
   onInput("layer-name", (input) => (state.layer = Number(input.value)));
   onInput("from", (input) => setSpan(Number(input.value), Math.max(Number(input.value), state.to)));
@@ -140,8 +149,9 @@ function walk(place, [axis, step]) {
 function onKey(event) {
   const { axis, across, up } = planeOf();
   const size = event.shiftKey ? 5 : 1;
+  const right = surface ? size : size * (images.signature.across(1) - images.signature.across(0));
   const steps = {
-    ArrowLeft: [across, -size], ArrowRight: [across, size], ArrowDown: [up, -size], ArrowUp: [up, size],
+    ArrowLeft: [across, -right], ArrowRight: [across, right], ArrowDown: [up, -size], ArrowUp: [up, size],
     ...(dimension === 3 ? { PageDown: [axis, -size], PageUp: [axis, size] } : {}),
   };
   const step = steps[event.key];

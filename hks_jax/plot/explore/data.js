@@ -20,6 +20,8 @@ const times = about.times;
 const inside = bytes("inside");
 const values = floats("values"); // for each time, at the inside nodes in the order of the grid
 const deviations = about.noise ? floats("deviation") : null; // the standard deviations of the values due to noise
+const scores = about.fades ? floats("z") : null; // distances from the values of constant tensors, as normal numbers
+const near = about.rim === null ? null : bytes("near"); // whether the boundary contributes over a tenth
 const layers = about.layers.map((layer, i) => ({ ...layer, values: floats(`layer-${i}`) }));
 const labels = about.labels.length ? integers("labels") : null;
 
@@ -43,7 +45,16 @@ function placeAt(node) {
 }
 
 // The indices of a node in the volume, or the number of a vertex in the mesh; the page has only vertices inside.
-const voxel = (place) => (surface ? [surface.numbers[place[0]]] : about.offset.map((o, a) => o + place[a]));
+function voxel(place) {
+  if (surface) return [surface.numbers[place[0]]];
+  const shown = about.offset.map((o, a) => o + place[a]);
+  if (!about.axes) return shown;
+  const { shown: axes, first, step } = about.axes;
+  return axes.map((axis, a) => first[a] + step[a] * shown[axis]);
+}
+
+// The axis of the volume that an axis of the page shows.
+const axisOfVolume = (axis) => (about.axes && axis < dimension ? about.axes.shown.indexOf(axis) : axis);
 
 function position(place) {
   if (surface) return [...surface.vertices.subarray(3 * place[0], 3 * place[0] + 3)];
@@ -60,14 +71,15 @@ const mean = times.map((_, t) => {
 
 // A quantity is the stored signature times a factor at each time.
 const ones = times.map(() => 1);
-const power = dimension === 2 ? "4πt" : "(4πt)³⁄²";
+const power = (dimension === 2 ? "4πt" : "(4πt)³⁄²") + (about.fick ? "√|D|" : "");
 const relative = { name: "HKS / mean", long: "HKS divided by its mean at each t", factor: mean.map((m) => 1 / m), centre: 1 };
 const isFlat = about.normalisation === "raw" || about.normalisation === "flat";
 const quantities = isFlat
   ? [
-      { name: `${power}·HKS`, long: `${power}·HKS, 1 where flat`, factor: ones, centre: 1 },
+      { name: `${power}·HKS`, long: `${power}·HKS, 1 where ${about.fick ? "D is constant" : "flat"}`, factor: ones, centre: 1 },
       relative,
-      { name: "HKS", long: "HKS", factor: about.flat.map((f) => 1 / f), centre: null, log: true },
+      // With Fick's operator the factor √|D| differs between nodes.
+      ...(about.fick ? [] : [{ name: "HKS", long: "HKS", factor: about.flat.map((f) => 1 / f), centre: null, log: true }]),
     ]
   : [
       { name: `HKS, ${about.normalisation}`, long: `HKS, normalised by ${about.normalisation}`, factor: ones, centre: null },

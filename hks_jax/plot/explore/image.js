@@ -1,6 +1,21 @@
 // An image of one slice on a canvas with colours, chosen points and a region's outline, and its pointer events.
 const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
+// A tile with a dark diagonal line that repeats in both directions.
+function hatching(dense) {
+  const tile = document.createElement("canvas");
+  const size = 7 * dense;
+  [tile.width, tile.height] = [size, size];
+  const pen = tile.getContext("2d");
+  [pen.strokeStyle, pen.lineWidth] = ["rgb(40 40 40 / 0.85)", dense];
+  for (const shift of [-size, 0, size]) {
+    pen.moveTo(shift - 1, size + 1);
+    pen.lineTo(shift + size + 1, -1);
+  }
+  pen.stroke();
+  return tile;
+}
+
 class SliceImage {
   constructor(canvas, events) {
     this.canvas = canvas;
@@ -34,11 +49,17 @@ class SliceImage {
     this.dense = dense;
   }
 
+  // In the radiological view, left is on the right: positions from left to right count from the other side.
+  across(x) {
+    const { across } = this.plane;
+    return about.mirrored && about.ends?.[across] === "LR" ? shape[across] - x : x;
+  }
+
   place(event) {
     const box = this.canvas.getBoundingClientRect();
     const x = ((event.clientX - box.left) * this.canvas.width) / box.width;
     const y = ((event.clientY - box.top) * this.canvas.height) / box.height;
-    return [(x - this.corner[0]) / this.cell[0], (this.corner[1] - y) / this.cell[1]]; // in cells from the corner
+    return [this.across((x - this.corner[0]) / this.cell[0]), (this.corner[1] - y) / this.cell[1]]; // in cells from the corner
   }
 
   gridPlace([x, y]) {
@@ -87,7 +108,7 @@ class SliceImage {
   }
 
   // colour(node, out) writes three numbers from 0 to 255.
-  draw(colour, { points, chosen, sticks }) {
+  draw(colour, { points, chosen, sticks, hatched }) {
     const { axis, across, up, index } = this.plane;
     const [nu, nv] = [shape[across], shape[up]];
     [this.tile.width, this.tile.height] = [nu, nv];
@@ -101,7 +122,7 @@ class SliceImage {
         const node = nodeAt(place);
         if (node < 0) continue;
         colour(node, rgb);
-        const p = 4 * ((nv - 1 - v) * nu + u);
+        const p = 4 * ((nv - 1 - v) * nu + Math.floor(this.across(u + 0.5)));
         for (let c = 0; c < 3; c++) pixels.data[p + c] = rgb[c];
         pixels.data[p + 3] = 255;
       }
@@ -112,14 +133,32 @@ class SliceImage {
     pen.imageSmoothingEnabled = false;
     const [w, h] = [nu * this.cell[0], nv * this.cell[1]];
     pen.drawImage(this.tile, this.corner[0], this.corner[1] - h, w, h);
+    if (hatched) this.drawHatching(pen, hatched);
     if (sticks) this.drawSticks(pen, sticks);
     if (chosen) this.drawOutline(pen, chosen);
     if (about.ends) this.drawEnds(pen);
     for (const [name, at] of Object.entries(points)) if (at) this.drawPoint(pen, name, at);
   }
 
+  // Diagonal lines over the cells of the nodes for which hatched(node) holds.
+  drawHatching(pen, hatched) {
+    const { axis, across, up, index } = this.plane;
+    const place = [0, 0, 0];
+    place[axis] = index;
+    pen.fillStyle = pen.createPattern(hatching(this.dense), "repeat");
+    for (let u = 0; u < shape[across]; u++) {
+      for (let v = 0; v < shape[up]; v++) {
+        [place[across], place[up]] = [u, v];
+        const node = nodeAt(place);
+        if (node < 0 || !hatched(node)) continue;
+        const [[x0, y0], [x1, y1]] = [this.toPixels(u, v), this.toPixels(u + 1, v + 1)].map((at) => at.map(Math.round));
+        pen.fillRect(Math.min(x0, x1), y1, Math.abs(x1 - x0), y0 - y1);
+      }
+    }
+  }
+
   toPixels(x, y) {
-    return [this.corner[0] + x * this.cell[0], this.corner[1] - y * this.cell[1]];
+    return [this.corner[0] + this.across(x) * this.cell[0], this.corner[1] - y * this.cell[1]];
   }
 
   drawSticks(pen, directions) {
@@ -136,7 +175,7 @@ class SliceImage {
         const node = nodeAt(place);
         if (node < 0) continue;
         const half = 0.48 * every * Math.min(...this.cell);
-        const [dx, dy] = [half * directions[3 * node + across], half * directions[3 * node + up]];
+        const [dx, dy] = [(this.across(1) - this.across(0)) * half * directions[3 * node + across], half * directions[3 * node + up]];
         const [x, y] = this.toPixels(u + 0.5, v + 0.5);
         pen.moveTo(x - dx, y + dy);
         pen.lineTo(x + dx, y - dy);
@@ -201,8 +240,9 @@ class SliceImage {
     const [x0, y0] = this.toPixels(0, 0);
     const [x1, y1] = this.toPixels(shape[across], shape[up]);
     const off = 8 * this.dense;
-    this.write(pen, about.ends[across][0], x0 - off, (y0 + y1) / 2, style("--soft"));
-    this.write(pen, about.ends[across][1], x1 + off, (y0 + y1) / 2, style("--soft"));
+    const out = x0 < x1 ? off : -off;
+    this.write(pen, about.ends[across][0], x0 - out, (y0 + y1) / 2, style("--soft"));
+    this.write(pen, about.ends[across][1], x1 + out, (y0 + y1) / 2, style("--soft"));
     this.write(pen, about.ends[up][0], (x0 + x1) / 2, y0 + off, style("--soft"));
     this.write(pen, about.ends[up][1], (x0 + x1) / 2, y1 - off, style("--soft"));
   }

@@ -32,8 +32,8 @@ function signatureScale() {
   const stretch = 2 ** -element("contrast").value;
   if (quantity.centre !== null) {
     const halves = spans.map(([half]) => half).sort((a, b) => a - b);
-    // Signatures are positive, so the colours reach from 0 to 2 at most before the contrast changes them.
-    const half = Math.max(Math.min(halves[halves.length >> 1], 1) * stretch, 1e-6);
+    // Signatures are positive, so the colours reach from 0 to 2 at most, with any contrast.
+    const half = Math.max(Math.min(halves[halves.length >> 1] * stretch, quantity.centre), 1e-6);
     return scaleOf("diverging", quantity.centre - half, quantity.centre + half);
   }
   const [low, high] = [Math.min(...spans.map((s) => s[0])), Math.max(...spans.map((s) => s[1]))];
@@ -51,18 +51,18 @@ const byScale = (scale, numberAt) => (node, rgb) => {
   [rgb[0], rgb[1], rgb[2]] = [scale.table[e], scale.table[e + 1], scale.table[e + 2]];
 };
 
-// Values within the noise of flat space, or of the mean, fade to grey. The fewer standard deviations, the greyer.
+// Values within the noise of those of constant tensors fade to grey. The smaller |z|, the greyer.
 function faded(colour) {
-  const { time, quantity } = state;
-  const middle = quantity === relative ? mean[time] : isFlat ? 1 : quantiles(count, (n) => values[time * count + n], [0.5])[0];
   const limit = Number(element("fade").value);
   return (node, rgb) => {
     colour(node, rgb);
-    const n = time * count + node;
-    const grey = 1 - Math.abs(values[n] - middle) / deviations[n] / limit;
+    const grey = 1 - Math.abs(scores[state.time * count + node]) / limit;
     if (grey > 0) for (let c = 0; c < 3; c++) rgb[c] += grey * (204 - rgb[c]);
   };
 }
+
+// Whether the boundary contributes over a tenth at a node and a time, if hatching is on.
+const hatchedAt = (t) => (near && element("rim").checked ? (node) => near[t * count + node] === 1 : null);
 
 const signatureAt = (node) => values[state.time * count + node] * state.quantity.factor[state.time];
 
@@ -88,7 +88,7 @@ for (const id of ["signature", "distance", "layer"]) {
     lassoing: () => state.region.kind === "lasso",
     lasso(polygon, plane) {
       if (surface) take(verticesInPolygon(polygon), "lasso");
-      else take(nodesInPolygon(polygon, plane), dimension === 3 ? `lasso, slice ${AXES[plane.axis]} = ${voxel(planePlace(plane))[plane.axis]}` : "lasso");
+      else take(nodesInPolygon(polygon, plane), dimension === 3 ? `lasso, slice ${sliceText(plane)}` : "lasso");
       render();
     },
     redraw: () => render(),
@@ -105,6 +105,11 @@ function planePlace(plane) {
   const place = [0, 0, 0];
   place[plane.axis] = plane.index;
   return place;
+}
+
+function sliceText(plane) {
+  const axis = axisOfVolume(plane.axis);
+  return `${AXES[axis]} = ${voxel(planePlace(plane))[axis]}`;
 }
 
 function layerText(layer, node) {
@@ -127,12 +132,13 @@ function drawImages() {
 
   const scale = signatureScale();
   const coloured = byScale(scale, signatureAt);
-  images.signature.draw(deviations ? faded(coloured) : coloured, shared);
+  images.signature.draw(scores ? faded(coloured) : coloured, { ...shared, hatched: hatchedAt(state.time) });
   showBar(element("signature-bar"), scale, quantity.centre);
   element("signature-name").textContent = `${quantity.name} at t = ${timeText(state.time)}`;
 
   const far = scaleOf("distance", 0, farApart);
-  images.distance.draw(byScale(far, (node) => apart[node]), shared);
+  // Curves whose last time feels the boundary differ by the boundary.
+  images.distance.draw(byScale(far, (node) => apart[node]), { ...shared, hatched: hatchedAt(state.to) });
   showBar(element("distance-bar"), far);
   element("distance-name").textContent = "A";
 
@@ -152,7 +158,8 @@ function drawLayer(layer, shared) {
       for (let a = 0; a < 3; a++) rgb[a] = Math.min(255, 25 + 330 * Math.abs(layer.values[3 * node + a]));
     };
     images.layer.draw(colour, { ...shared, sticks: layer.values });
-    bar.textContent = `red: along x, green: along y${dimension === 3 ? ", blue: along z" : ""}`;
+    const along = (a) => (about.ends ? [...about.ends[a]].join("–") : AXES[a]);
+    bar.textContent = ["red", "green", "blue"].slice(0, dimension).map((name, a) => `${name}: along ${along(a)}`).join(", ");
   } else {
     layer.span ??= quantiles(count, (n) => layer.values[n], [0.01, 0.98]);
     const scale = scaleOf("grey", ...layer.span);
@@ -233,12 +240,14 @@ function showPoints() {
 
 function showControls() {
   const { axis, index } = planeOf();
+  const felt = near ? nodesWhere((n) => near[state.time * count + n] === 1).length / count : 0;
   element("time-text").textContent = `t = ${timeText(state.time)}${spreadText(state.time)}`;
-  element("fade-text").textContent = `${element("fade").value} σ`;
+  element("rim-text").textContent = `hatch the boundary (${Math.round(100 * felt)} %)`;
+  element("fade-text").textContent = `|z| = ${element("fade").value}`;
   element("time").setAttribute("aria-valuetext", element("time-text").textContent);
   element("slice").max = shape[axis] - 1;
   element("slice").value = index;
-  element("slice-text").textContent = `${AXES[axis]} = ${voxel(planePlace(planeOf()))[axis]}`;
+  element("slice-text").textContent = sliceText(planeOf());
   element("slice").setAttribute("aria-valuetext", element("slice-text").textContent);
   for (const id of ["from", "to"]) {
     element(`${id}-text`).textContent = timeText(state[id]);

@@ -124,7 +124,7 @@ class SurfaceImage extends SliceImage {
     else if (event && !from.moved) this.events.pick(this.gridPlace(this.place(event)), event.shiftKey);
   }
 
-  draw(colour, { points, chosen }) {
+  draw(colour, { points, chosen, hatched }) {
     const { width, height, face, weights, light, at } = this.raster;
     const pixels = new ImageData(width, height);
     const rgb = [0, 0, 0];
@@ -134,13 +134,17 @@ class SurfaceImage extends SliceImage {
       const [second, third] = [weights[2 * pixel], weights[2 * pixel + 1]];
       const sum = [0, 0, 0];
       let part = 0;
+      let boundary = 0;
       for (let corner = 0; corner < 3; corner++) {
         const weight = corner === 0 ? 1 - second - third : corner === 1 ? second : third;
         const node = surface.faces[3 * f + corner];
         colour(node, rgb);
         for (let c = 0; c < 3; c++) sum[c] += weight * rgb[c];
         if (chosen && chosen[node] === 1) part += weight;
+        if (hatched?.(node)) boundary += weight;
       }
+      const line = boundary > 0.5 && (pixel % width + Math.floor(pixel / width)) % Math.round(7 * this.dense) < this.dense;
+      if (line) for (let c = 0; c < 3; c++) sum[c] *= 0.25;
       const edge = part > 0.3 && part < 0.7;
       for (let c = 0; c < 3; c++) pixels.data[4 * pixel + c] = edge ? [112, 72, 182][c] : light[f] * sum[c];
       pixels.data[4 * pixel + 3] = 255;

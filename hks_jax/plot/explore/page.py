@@ -5,9 +5,10 @@ import html
 import json
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -19,11 +20,13 @@ from hks_jax.checks import require_real
 from hks_jax.domain.simplicial_mesh import SurfaceMesh, TetMesh
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result, require_result
-from hks_jax.plot.orientation import LETTERS
+from hks_jax.io.units import MEDIAN, MM2_PER_S
+from hks_jax.plot.orientation import Orientation, View
 from hks_jax.plot.panels import checked_times
-from hks_jax.plot.signature import METRICS, bounding_box
+from hks_jax.plot.signature import FICK, METRICS, bounding_box, placed
 from hks_jax.plot.volumes import middle_node
 from hks_jax.signatures.regions import region_statistics
+from hks_jax.signatures.times import FREE
 from hks_jax.storage import atomic_path
 
 SCRIPTS = ("data", "colours", "image", "mesh", "curves", "regions", "controls", "main")
@@ -42,6 +45,7 @@ def explore(
     label_names: Mapping[int, str] | None = None,
     title: str = "Heat kernel signature",
     unit: str | None = None,
+    view: View = "neurological",
 ) -> Path:
     """Write an HTML page to explore a signature on a grid or a surface in any browser, without a network.
 
@@ -57,16 +61,19 @@ def explore(
         result: the signature at increasing times. Nodes without finite values at all times are omitted; on a surface,
             all values must be finite. The normalisations ``"raw"`` and ``"flat"`` are shown as (4πt)^(d/2)·HKS, which
             is 1 for flat space without boundary, with colours that diverge from 1. If ``arrays["deviation"]`` is given,
-            curves have error bands, and values fade if noise explains their difference from flat space, the mean or the
-            median. Tensors, if given, appear as mean eigenvalue, anisotropy and direction (red, green and blue for x, y
-            and z). With an affine, positions are shown in space, and the sides of images have the letters L and R, P
-            and A, I and S. For the metric D⁻¹, the diffusion length √(Dt) is shown beside t.
+            curves have error bands. If ``arrays["z"]`` (`hks_jax.Uncertainty.z`) is given, values fade if noise
+            explains their difference from constant tensors. Tensors, if given, appear as mean eigenvalue, anisotropy
+            and direction (red, green and blue for x, y and z). With an affine, positions are shown in space, images are
+            turned as by `Orientation`, and their sides have the letters L and R, P and A, I and S. If t is a time, the
+            diffusion length √(Dt) is shown beside it. If ``arrays["influence"]`` is given, nodes at which the boundary
+            contributes over a tenth are hatched.
         path: the file of the page; its folder is created.
         maps: additional maps (*shape) by name.
         labels: (*shape) integers that define regions, 0 for none.
         label_names: the names of the labels.
         title: the page's title.
         unit: the unit of t, by default the unit of the result.
+        view: ``"neurological"`` (left is on the left) or ``"radiological"`` (left is on the right), for data in space.
 
     Returns:
         The path.
@@ -83,10 +90,13 @@ def explore(
         '<!doctype html>'
     """
     require_result(result)
+    axes, turned, facts = None, None, _facts(result)
+    if isinstance(result.place, TensorVolume) and (turned := placed(result.place, None, view)) is not None:
+        result, maps, labels, axes = _turned(result, maps, labels, turned)
     mesh, noise = result.place, result.arrays.get("deviation")
     if isinstance(mesh, TetMesh):
         raise ValueError(f"{result.source}: got a result on tetrahedra; expected a grid or a surface. Use ParaView")
-    t = checked_times(result.times, result.values.shape[1:], values=result.values, deviation=noise)
+    t = checked_times(result.times, result.values.shape[1:], values=result.values, deviation=noise, z=result.z)
     if not (np.isfinite(t).all() and t[0] > 0 and (np.diff(t) > 0).all()):
         raise ValueError(f"times: got {t}; expected positive numbers in increasing order")
     inside = np.isfinite(result.values).all(axis=0)
@@ -109,42 +119,53 @@ def explore(
             raise ValueError(f"maps[{name!r}]: got shape {np.shape(values)}; expected the grid's shape {inside.shape}")
         require_real(f"maps[{name!r}]", values)
         layers[name] = np.asarray(values)[inside]
-    size = 4 * (int(inside.sum()) * t.size * (2 if noise is not None else 1) + sum(map(np.size, layers.values())))
+    maps_shown = 1 + (noise is not None) + (result.z is not None)
+    size = 4 * (int(inside.sum()) * t.size * maps_shown + sum(map(np.size, layers.values())))
     if size > LIMIT:
         raise ValueError(
             f"values: {t.size} times at {int(inside.sum())} nodes take {size / 1024**2:.0f} MiB; expected at most "
             f"{LIMIT // 1024**2} MiB, which a browser can open. Show fewer times, one slice, or part of the domain"
         )
     # (4πt)^(d/2)·HKS is of order 1 in any unit, so float32 does not underflow.
-    scale = result.flat_scale if result.normalisation == "raw" else 1.0
+    scale = result.to_flat if result.normalisation == "raw" else 1.0
     shown = {"values": (scale * result.values)[:, inside]}
     if noise is not None:
         shown["deviation"] = (scale * noise)[:, inside]
+    if result.z is not None:
+        shown["z"] = result.z[:, inside]
+    near = result.near_rim
+    if near is not None:
+        shown["near"] = near[:, inside]
     box = bounding_box(inside, margin=0)
     shown_inside = inside[inside] if surface else inside[box]
     numbers = {"inside": _base64(shown_inside, "u1")}
-    numbers |= {name: _base64(array, "<f4") for name, array in shown.items()}
+    numbers |= {name: _base64(array, "u1" if name == "near" else "<f4") for name, array in shown.items()}
     numbers |= {f"layer-{i}": _base64(array, "<f4") for i, array in enumerate(layers.values())}
     names: dict[int, str] = {}
     if labels is not None:
         numbers["labels"], names = _regions(labels, label_names, inside)
     about = {
         "title": title,
-        "facts": [[name, str(value)] for name, value in _facts(result).items()],
+        "facts": [[name, str(value)] for name, value in facts.items()],
         "software": f"hks-jax {__version__}",
         "dimension": result.dimension,
         "mesh": bool(surface),
         "shape": shown_inside.shape,
         "offset": [part.start for part in box],
         **place,
-        **_in_space(result),
+        **_in_space(result, axes),
+        "ends": None if turned is None else list(turned.ends),
+        "mirrored": view == "radiological",
         "unit": result.unit if unit is None else unit,
         "lengthUnit": result.length_unit,
         "times": t.tolist(),
         "lengths": None if result.lengths is None else result.lengths.tolist(),
         "flat": result.flat_scale.ravel().tolist(),
+        "fick": result.settings.get("operator") == "fick",
         "normalisation": result.normalisation,
         "noise": noise is not None,
+        "fades": result.z is not None,
+        "rim": None if near is None else FREE,
         "start": [0] if surface else middle_node(shown_inside),
         "layers": [
             {"name": name, "kind": "scalar" if array.ndim == 1 else "direction"} for name, array in layers.items()
@@ -169,8 +190,12 @@ def _facts(result: Result) -> dict[str, Any]:
         facts |= {"vertices": len(place.vertices), "triangles": len(place.triangulation.cells)}
     if metric := settings.get("metric"):
         facts["metric"] = METRICS[metric]
+    if settings.get("operator") == "fick":
+        facts["operator"] = FICK
     if boundary := settings.get("boundary"):
         facts["boundary"] = boundary if isinstance(boundary, str) else json.dumps(boundary)
+    if result.diffusivity is not None:
+        facts["D in √(Dt)"] = f"{result.diffusivity:.3g}{f' {MM2_PER_S}' * (result.unit == 's')}, {MEDIAN}"
     if result.eigenvalues.size and settings.get("method", "spectral") == "spectral":
         facts["eigenpairs"] = len(result.eigenvalues)
     return facts
@@ -208,17 +233,49 @@ def _regions(
     return _base64(np.asarray(labels)[inside], "<i4"), {label: known[label] for label in present}
 
 
-def _in_space(result: Result) -> dict[str, Any]:
-    """Return the matrix from indices to space coordinates, and the letters (L, R, …) of the grid's sides."""
+class _Axes(NamedTuple):
+    """For each axis of the volume, its axis in the page, and the index in the volume of its first node and its step."""
+
+    shown: list[int]
+    first: list[int]
+    step: list[int]
+
+
+def _turned(
+    result: Result, maps: Mapping[str, Any] | None, labels: Any, by: Orientation
+) -> tuple[Result, dict[str, Any], Any, _Axes]:
+    """Return a result, maps and labels with nodes and components along the axes of images, and the axes."""
+    volume, shape = result.volume, result.volume.shape
+    for name, values in [*(maps or {}).items(), *([] if labels is None else [("labels", labels)])]:
+        if np.shape(values) != shape:
+            name = name if name == "labels" else f"maps[{name!r}]"
+            raise ValueError(f"{name}: got shape {np.shape(values)}; expected the grid's shape {shape}")
+    shown = [by.axes.index(a) for a in range(volume.dimension)]
+    flipped = [by.turned[s] for s in shown]
+    axes = _Axes(shown, [n - 1 if f else 0 for n, f in zip(shape, flipped, strict=True)], [1 - 2 * f for f in flipped])
+    grid = by.grid(result.grid)
+    place = replace(
+        volume,
+        tensors=by.tensors(volume.tensors),
+        mask=by.array(volume.inside),
+        spacing=grid.spacing,
+        origin=grid.origin,
+        covariance=None,
+        modes=None,
+    )
+    arrays = {name: by.array(a) for name, a in result.arrays.items() if name in ("deviation", "influence")}
+    arrays |= {name: a for name, a in result.arrays.items() if name == "input_tensors"}
+    result = replace(result, place=place, values=by.array(result.values), arrays=arrays)
+    return result, {k: by.array(v) for k, v in (maps or {}).items()}, None if labels is None else by.array(labels), axes
+
+
+def _in_space(result: Result, axes: _Axes | None) -> dict[str, Any]:
+    """Return the matrix from the volume's indices to coordinates in space, and the indices of shown nodes."""
     volume = result.place
-    if not isinstance(volume, TensorVolume) or volume.affine is None:
-        return {"world": None, "ends": None}
+    if not isinstance(volume, TensorVolume) or volume.affine is None or axes is None:
+        return {"world": None, "axes": None}
     matrix = volume.affine[:3, [a for a in range(4) if volume.dimension == 3 or a != volume.thin_axis]]
-    ends = []
-    for direction in matrix[:, :-1].T:
-        axis = int(np.argmax(np.abs(direction)))
-        ends.append(LETTERS[axis] if direction[axis] > 0 else LETTERS[axis][::-1])
-    return {"world": matrix.tolist(), "ends": ends}
+    return {"world": matrix.tolist(), "axes": axes._asdict()}
 
 
 def _assemble(about: dict[str, Any], numbers: dict[str, str]) -> str:

@@ -1,0 +1,75 @@
+"""Find the input files of a command, and refuse outputs that would replace them."""
+
+import argparse
+from collections.abc import Iterator
+from contextlib import suppress
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+from hks_jax.cli.noise import second_scan
+from hks_jax.cli.options import flag, options_in
+from hks_jax.io.masks import names_beside
+from hks_jax.io.nifti import is_nifti, siblings, sidecar_of
+from hks_jax.io.result import signature_file
+
+_INPUTS = ("FILE", "RESULT", "SUBJECTS", "TARGET")
+"""The words in the table of options that stand for input files."""
+
+
+def tensor_files(args: argparse.Namespace) -> dict[str, list[str]]:
+    """Return the files from which the tensors of a volume are read, grouped by role."""
+    images = [args.file, *args.others]
+    if not args.others and args.bval is None:
+        images = siblings(args.file)
+    sidecar = sidecar_of(images[0]) if args.bval is None and is_nifti(images[0]) else None
+    sidecars = [] if sidecar is None or not sidecar.is_file() else [sidecar]
+    given = {"file": images, "sidecar": sidecars, "mask": [args.mask], "bval": [args.bval], "bvec": [args.bvec]}
+    inputs = {role: [str(path) for path in paths if path is not None] for role, paths in given.items()}
+    if (second := second_scan(args)) is not None:
+        of_second = tensor_files(second)
+        inputs["noise"] = [*of_second["file"], *of_second["sidecar"]]
+    return inputs
+
+
+def _inputs(args: argparse.Namespace) -> Iterator[tuple[str, Path]]:
+    """Yield the options and the paths of the existing input files of a command."""
+    names = [option.name for option in options_in(args.command.OPTIONS) if option.settings.get("metavar") in _INPUTS]
+    given = vars(args)
+    for name in dict.fromkeys(["file", *names]):
+        path = given.get(name)
+        if path is not None:
+            yield flag(name), signature_file(path)
+    implied = [*given.get("others", ())]
+    implied += [names_beside(given[name]) for name in ("atlas", "labels") if given.get(name) is not None]
+    with suppress(Exception):  # reading reports missing and damaged files
+        implied += [path for paths in tensor_files(args).values() for path in paths]
+    yield from (("FILE", Path(path)) for path in implied if path is not None)
+
+
+def require_inputs_kept(args: argparse.Namespace) -> None:
+    """Raise ValueError if a command would replace one of its input files.
+
+    The function `writes` of the command's module returns the paths that the command may write. Their last parts may be
+    patterns, and the part ``**`` means all folders below.
+    """
+    written: list[Path] = args.command.writes(args) if hasattr(args.command, "writes") else []
+    for option, path in _inputs(args):
+        for output in written:
+            if not (option == "--checkpoint" and output == path) and _replaces(output, path):
+                raise ValueError(
+                    f"{path}: this input file would be replaced by the output {output}. Choose another output"
+                )
+
+
+def _replaces(output: Path, path: Path) -> bool:
+    if not path.exists():
+        return False
+    if output.exists() and output.samefile(path):
+        return True
+    below = output.parent.name == "**"
+    folder = (output.parent.parent if below else output.parent).resolve()
+    for place in (path.parent.resolve() / path.name, path.resolve()):
+        inside = place.is_relative_to(folder) if below else place.parent == folder
+        if inside and (place.name == output.name or fnmatchcase(place.name, output.name)):
+            return True
+    return False
