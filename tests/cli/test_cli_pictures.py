@@ -103,7 +103,7 @@ def test_curvature_end_to_end(sphere, tmp_path, capsys):
     assert found["least"] == K[mask].min()
     with np.load(sphere) as read:
         area = np.sum(np.sqrt(np.linalg.det(read["tensors"]))[mask]) * np.prod(read["spacing"])
-    assert found["total"] == pytest.approx(area, rel=3e-2)
+    assert found["total"] == pytest.approx(area, rel=5e-2)
     # and the picture of the result
     assert (
         main(["plot", str(out / "curvature.npz"), "-o", str(tmp_path / "K.png"), "--cmap", "RdBu_r", "--range=-2,2"])
