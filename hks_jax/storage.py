@@ -1,5 +1,6 @@
 """Atomic writing of files, exclusive work by one process, errors for damaged files, and NumPy's file formats."""
 
+import gzip
 import io
 import math
 import os
@@ -140,6 +141,12 @@ def existing(path: str | os.PathLike[str]) -> Path:
         what = "is a folder; expected a file" if file.is_dir() else "no such file"
         raise FileNotFoundError(f"{file}: {what}")
     return file
+
+
+def content_of(path: Path) -> bytes:
+    """Return the bytes of a file, decompressed if they begin with gzip's magic number, whatever the file's name."""
+    content = path.read_bytes()
+    return gzip.decompress(content) if content.startswith(b"\x1f\x8b") else content
 
 
 @contextmanager

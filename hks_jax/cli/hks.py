@@ -4,8 +4,8 @@ Compute the heat kernel signature of a field of diffusion tensors. FILE contains
 
   tensors                    of a volume; --metric is required, and --slice restricts the computation to a slice
   diffusion-weighted images  with --bval and --bvec, to which tensors are fitted
-  a mesh                     of triangles or tetrahedra, with the Euclidean metric, or of tensors at its vertices
-                             (--array), or of tensors in a volume (--tensors)
+  a mesh                     of triangles or tetrahedra, with the Euclidean metric, or of tensors at its vertices or
+                             cells (--array), or of tensors in a volume (--tensors)
   eigenpairs                 written by --save-pairs, for other times, or another normalisation or method
 
 The command writes to the folder OUT: hks.npz, an image or a mesh in FILE's format, hks.png and report.json. Times are
@@ -33,16 +33,16 @@ from jaxtyping import Bool
 from hks_jax import SurfaceMesh, TensorNoise, TetMesh, assemble
 from hks_jax.cli import pairs as saved_pairs
 from hks_jax.cli.computation import Settings, compute_pairs, result_of, solve, use_dtype
-from hks_jax.cli.info import describe_mesh
+from hks_jax.cli.info import describe_mesh, listed
 from hks_jax.cli.noise import Noisy, check_noise, noise_of_volume, signature_of, with_error_bars
 from hks_jax.cli.options import READING, SOLVING, options_in, refuse
 from hks_jax.cli.outputs import PAIRS, REPORT, Done, of_earlier, write_outputs
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read, read_volume, require_metric, require_one
 from hks_jax.fem.assembly import MESH_BOUNDARIES
-from hks_jax.io import read_mask, read_mesh, read_mesh_arrays, sample_tensors
+from hks_jax.io import read_mask, read_mesh, sample_tensors
 from hks_jax.io.formats import format_of
-from hks_jax.io.mesh import WRITTEN, is_mesh
+from hks_jax.io.mesh import WRITTEN, arrays_by_place, is_mesh
 from hks_jax.io.repair import require_valid
 from hks_jax.io.result import Result
 from hks_jax.io.tensor_order import matrices
@@ -66,7 +66,7 @@ OPTIONS = f"""
 """
 
 _OF_TENSORS = ("metric", "operator", "order", "interpolation")
-"""Options that refer to tensors at the vertices of a mesh."""
+"""Options that refer to tensors of a mesh."""
 _NO_NOISE = "this option needs tensors; saved eigenpairs and meshes with the Euclidean metric have none. Leave it out"
 
 
@@ -143,7 +143,7 @@ def _check_mesh_options(args: argparse.Namespace) -> None:
     if args.others:
         raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one mesh")
     if args.tensors and args.array:
-        raise ValueError("--tensors, --array: got both; expected tensors either in a volume or at the mesh's vertices")
+        raise ValueError("--tensors, --array: got both; expected tensors either in a volume or in the mesh's file")
     of_grids = ["slice", "through", "view", "save_pairs", "components", "method"]
     if not args.tensors:  # with --tensors, the options for reading refer to the volume
         of_grids += [o.name for o in options_in(READING) if o.name not in (*_OF_TENSORS, "array")]
@@ -156,14 +156,14 @@ def _check_mesh_options(args: argparse.Namespace) -> None:
         refuse(args, ("noise",), _NO_NOISE)
     elif args.metric is None and args.operator != "fick":
         raise ValueError(
-            "--metric: the tensors at the vertices need a metric. Choose inverse, tensor or adjugate, or pass "
+            "--metric: the tensors of the mesh need a metric. Choose inverse, tensor or adjugate, or pass "
             "--operator fick"
         )
     require_one(args)
 
 
 def _read_domain(args: argparse.Namespace, progress: Progress) -> tuple[SurfaceMesh | TetMesh, Noisy | None]:
-    """Read the mesh in the chosen precision, with the metric of tensors at its vertices if there are any.
+    """Read the mesh in the chosen precision, with the metric of its tensors if there are any.
 
     For error bars, also return the tensors and their noise, at the voxels if the tensors come from a volume.
     """
@@ -177,9 +177,9 @@ def _read_domain(args: argparse.Namespace, progress: Progress) -> tuple[SurfaceM
             kind(vertices, cells, mask=inside)
         except ValueError as error:
             raise ValueError(f"--inside: {str(error).removeprefix('mask: ')}") from error
-    settings: Any = {"at": "vertices", "interpolation": args.interpolation, "mask": inside}
 
-    def domain(tensors: Any) -> SurfaceMesh | TetMesh:
+    def domain(tensors: Any, at: str = "vertices") -> SurfaceMesh | TetMesh:
+        settings: Any = {"at": at, "interpolation": args.interpolation, "mask": inside}
         return kind.from_tensors(vertices, cells, tensors, args.metric, operator=args.operator, **settings)
 
     if args.tensors:
@@ -195,13 +195,25 @@ def _read_domain(args: argparse.Namespace, progress: Progress) -> tuple[SurfaceM
         noise = noise_of_volume(args, volume, volume.grid("all"), progress)
         noisy = None if noise is None else Noisy(volume.tensors, noise, sampled, traceable=False)
         return sampled(volume.tensors), noisy
+    arrays = arrays_by_place(args.file, args.clean)
     if not args.array:
+        for each in (each for each in listed(arrays) if each["components"] in (6, 9)):
+            progress.note(
+                f"the {each['components']} components of {each['name']} at the {each['at']} are not used, and the mesh "
+                f"has the Euclidean metric. To use them, pass --array {each['name']}"
+                + " and --order"
+                * (each["components"] == 6)
+            )
         return kind(vertices, cells, mask=inside), None
-    arrays = read_mesh_arrays(args.file, clean=args.clean)
-    if args.array not in arrays:
-        there = ", ".join(arrays) or "none"
-        raise ValueError(f"--array: got {args.array!r}; expected one of the arrays at the vertices: {there}")
-    values = arrays[args.array].reshape(len(vertices), -1)
+    places = [at for at, there in arrays.items() if args.array in there]
+    if not places:
+        there = "; ".join(f"at the {at}: {', '.join(named) or 'none'}" for at, named in arrays.items())
+        raise ValueError(f"--array: got {args.array!r}; expected one of the arrays {there}")
+    if len(places) > 1:
+        progress.note(f"--array: {args.array} is at the {' and at the '.join(places)}; the {places[0]} are used")
+    domain = partial(domain, at=places[0])
+    values = arrays[places[0]][args.array]
+    values = values.reshape(len(values), -1)
     if values.shape[1] != (9 if args.order is None else 6):
         n = values.shape[1]
         raise ValueError(f"--array: got {args.array!r} with {n} components; expected 9, or 6 with --order")
@@ -212,8 +224,7 @@ def _read_domain(args: argparse.Namespace, progress: Progress) -> tuple[SurfaceM
         level = float(args.noise)
     except ValueError:
         raise ValueError(
-            f"--noise: got {args.noise!r}; expected a number, relative to the mean diffusivity, for tensors at the "
-            "vertices of a mesh"
+            f"--noise: got {args.noise!r}; expected a number, relative to the mean diffusivity, for tensors of a mesh"
         ) from None
     return domain(tensors), Noisy(tensors, TensorNoise.relative(tensors, level), domain)
 

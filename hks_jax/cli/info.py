@@ -3,7 +3,8 @@
 Describe a file of tensors: the shape, the order of the components and its source, the frame, the units, the mask and
 its connected components, the eigenvalues, the number of tensors that are not positive definite, and suitable k and t.
 The command also asks questions if the frame or a unit looks wrong. For a mesh of triangles or tetrahedra
-({meshes}, or a FreeSurfer surface), it gives the size, the boundary, the connected components, and suitable k and t.
+({meshes}, or a FreeSurfer surface), it gives the size, the boundary, the connected components, the arrays at vertices
+and cells, and suitable k and t.
 For a result of another command, it gives the times and settings, and the commands that draw the result.
 
 examples:
@@ -26,14 +27,14 @@ from hks_jax.cli.computation import times_in_words
 from hks_jax.cli.options import READING, as_options
 from hks_jax.cli.pairs import arrays_in
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import read
+from hks_jax.cli.reading import outside_note, read, without_element
 from hks_jax.domain.components import label_nodes
 from hks_jax.domain.simplices import WORDS, signed_measure
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_checks import MANY, unsymmetric
 from hks_jax.fem.boundary import BoundarySpec, default_boundary
 from hks_jax.io import TensorVolume, find_invalid, read_mesh
-from hks_jax.io.mesh import is_mesh
+from hks_jax.io.mesh import arrays_by_place, is_mesh
 from hks_jax.io.repair import least_admissible
 from hks_jax.io.result import NAMES, Result, signature_file
 from hks_jax.io.units import MEDIAN, MM2_PER_S, by_axis, is_plausible, unit_of_times
@@ -53,6 +54,7 @@ def run(args: argparse.Namespace, progress: Progress) -> None:
         description = _describe_result(result)
     elif is_mesh(args.file):
         description = {"file": str(args.file), **describe_mesh(args.file, read_mesh(args.file, clean=args.clean))}
+        description["arrays"] = listed(arrays_by_place(args.file, args.clean))
     else:
         description = {**describe(args.file, read(args, progress, questions.append)), "questions": questions}
     print(json.dumps(description, indent=2, ensure_ascii=False) if args.json else "\n".join(_lines(description)))
@@ -110,7 +112,7 @@ def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = N
         "inside": int(inside.sum()),
         "masked": volume.mask is not None,
         "components": count,
-        "without_element": int((inside & (labels == 0)).sum()),
+        "without_element": int(without_element(volume).sum()),
         "boundary": boundary,
         "component_sizes": np.sort(np.bincount(labels.ravel())[1:])[::-1][:10].tolist(),
         "not_positive_definite": not_positive,
@@ -157,6 +159,15 @@ def describe_mesh(path: Path, mesh: SimplicialMesh) -> dict[str, Any]:
     }
 
 
+def listed(arrays: dict[str, dict[str, np.ndarray]]) -> list[dict[str, Any]]:
+    """Return the names, places and numbers of components of a mesh's arrays."""
+    return [
+        {"name": name, "at": at, "components": math.prod(values.shape[1:])}
+        for at, named in arrays.items()
+        for name, values in named.items()
+    ]
+
+
 def _plain(value: Any) -> str:
     if isinstance(value, list | tuple):
         return ", ".join(map(_plain, value))
@@ -168,9 +179,14 @@ def _lines(description: dict[str, Any]) -> list[str]:
         return [f"{name:<16}{_plain(value)}" for name, value in description.items() if value]
     lines = [f"{description['file']}: {description['format']}, SHA-256 {description['sha256'][:16]}…"]
     if "vertices" in description:
-        left_out = ("file", "format", "sha256", "suits")
+        left_out = ("file", "format", "sha256", "suits", "arrays")
         facts = {name.replace("_", " "): value for name, value in description.items() if name not in left_out}
         lines += [f"{name:<18}{_plain(value)}" for name, value in facts.items()]
+        for array in description.get("arrays", ()):
+            use = "; to use its tensors, pass --array and --metric to hks-jax hks" * (array["components"] in (6, 9))
+            lines.append(
+                f"array             {array['name']} at the {array['at']}, components: {array['components']}{use}"
+            )
     else:
         bad, sizes = description["not_positive_definite"], ", ".join(map(str, description["component_sizes"]))
         singular, least = description["nearly_singular"], description["least_admissible_eigenvalue"]
@@ -187,10 +203,7 @@ def _lines(description: dict[str, Any]) -> list[str]:
             f"{', with k eigenpairs for two problems together' * (description['boundary'] == 'mean')}",
         ]
         if description["without_element"]:
-            lines.append(
-                f"                {description['without_element']} voxels of the mask are left out, because they "
-                "belong to no element; an element is a cube (in a slice a square) of adjacent voxels of the mask"
-            )
+            lines.append(f"                {outside_note(description['without_element'])}")
         lines.append(f"invalid         {bad} tensors are not positive definite")
         if "question" in description:
             lines.append(f"                {as_options(description['question'])}")

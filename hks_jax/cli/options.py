@@ -52,7 +52,7 @@ file FILE...
 --unit UNIT
     unit of the tensors, which are converted to mm2/s. Water in living tissue has about 7e-4 mm2/s, which is 0.7 um2/ms,
     700 um2/s (TORTOISE) or 7e-10 m2/s. With --bval, the b-values have the reciprocal unit
---array NAME  name of the tensors' array in an npz or VTK file with several arrays
+--array NAME  name of the tensors' array in an npz or VTK file with several arrays, or in the file of a mesh
 --spacing H...  distance between nodes, for .npy and .npz files that do not contain it
 --confidence C = 0.5  confidence above which a voxel of NRRD's masked tensors belongs to the mask
 [invalid] tensors that are not positive definite: by default, they raise an error
@@ -253,6 +253,15 @@ def flag(name: str) -> str:
     return ("-" if len(name) == 1 else "--") + name.replace("_", "-")
 
 
+_REMEDIES = {
+    "clean=True repairs some defects: see read_mesh": "--clean repairs some defects",
+    "Read surfaces with in_space=True, use a larger mask, or leave these points out": (
+        "Pass a larger --mask, or pass --inside with the vertices inside the mask, to leave these points out"
+    ),
+}
+"""Remedies in the library's messages, and their forms with options."""
+
+
 def as_options(message: str, names: Iterable[str] = SPELLED) -> str:
     """Return a message of the library with the named arguments replaced by options of the command line.
 
@@ -266,7 +275,9 @@ def as_options(message: str, names: Iterable[str] = SPELLED) -> str:
         message = re.sub(argument, rf"\1 {flag(name)}", message)
     for name, option in (("iterations", "--erode"), ("level", "--noise")):
         message = re.sub(rf"^{name}: ", f"{option}: ", message)
-    return message.replace("clean=True repairs some defects: see read_mesh", "--clean repairs some defects")
+    for words, options in _REMEDIES.items():
+        message = message.replace(words, options)
+    return message
 
 
 FILES = [o.name for o in options_in("@voxels @dwi @atlas @names") if o.settings.get("type") is Path]

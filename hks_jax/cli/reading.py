@@ -6,9 +6,11 @@ from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Bool
 
 from hks_jax.cli.options import as_options, refuse
 from hks_jax.cli.progress import Progress
+from hks_jax.domain.components import label_nodes
 from hks_jax.io import TensorVolume, erode, fit_dwi, positive_tensors, read_mask, read_tensors, repair_tensors
 from hks_jax.io.formats import format_of
 from hks_jax.io.plausibility import reviewed
@@ -47,8 +49,23 @@ def read_volume(args: argparse.Namespace, progress: Progress) -> TensorVolume:
     require_metric(args, volume)
     if 1 in volume.shape:
         raise ValueError(f"--slice: the volume is one voxel thick. Pass --slice {'xyz'[volume.shape.index(1)]}=0")
+    if lost := int(without_element(volume).sum()):
+        progress.note(outside_note(lost))
     require_valid(volume.with_mask(volume.grid(args.components).mask), "--repair")
     return volume
+
+
+def without_element(volume: TensorVolume) -> Bool[np.ndarray, "*shape"]:
+    """Mark the voxels of the mask that belong to no element, which the computation leaves out."""
+    return volume.inside & (label_nodes(volume.inside, (False,) * volume.dimension)[0] == 0)
+
+
+def outside_note(count: int) -> str:
+    """Return a note about voxels of the mask that belong to no element."""
+    return (
+        f"{count} voxels of the mask are left out, because they belong to no element; an element is a cube (in a slice "
+        "a square) of adjacent voxels of the mask"
+    )
 
 
 def read(args: argparse.Namespace, progress: Progress, ask: Callable[[str], None] | None = None) -> TensorVolume:

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from hks_jax.domain.components import as_mask
 from hks_jax.domain.grid import per_axis
 from hks_jax.io.tensor_order import Matrices, matrices, to_voxel_axes
-from hks_jax.io.volume import Format, TensorVolume, describe_tensors
+from hks_jax.io.volume import Format, TensorVolume, describe_tensors, mask_in_file
 from hks_jax.storage import load_npy, load_npz, write_npz
 
 
@@ -67,7 +66,7 @@ def volume_of(name: str, arrays: Mapping[str, Any], tensors: Float[np.ndarray, "
         tensors,
         per_axis(f"{name}: spacing", arrays.get("spacing", 1.0), d),
         per_axis(f"{name}: origin", arrays.get("origin", 0.0), d),
-        None if mask is None else as_mask(f"{name}: mask", mask),
+        None if mask is None else mask_in_file(f"{name}: mask", mask),
         None if affine is None else _real(f"{name}: affine", affine),
         None if axis is None else np.asarray(axis).tolist(),
         length_unit=_text(arrays, "length_unit"),

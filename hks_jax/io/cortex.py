@@ -5,7 +5,6 @@ image volume, and the columns of A and S are the volume's axes in scanner coordi
 ([systems](https://surfer.nmr.mgh.harvard.edu/fswiki/CoordinateSystems)).
 """
 
-import gzip
 import re
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import numpy as np
 
 from hks_jax.io.mesh_formats import Loaded
 from hks_jax.optional import optional
-from hks_jax.storage import reading
+from hks_jax.storage import content_of, reading
 
 _TRIANGLES = b"\xff\xff\xfe"
 """The first bytes of FreeSurfer's files of triangles."""
@@ -58,7 +57,7 @@ def load_freesurfer(path: Path, in_space: bool = False) -> Loaded:
         }
         axes = [told.get(name + b"ras", np.zeros(0)) for name in (b"x", b"y", b"z", b"c")]
         vertices = _from_own_axes(path, vertices, axes)
-    return Loaded(vertices, np.asarray(faces, np.int64), {})
+    return Loaded(vertices, np.asarray(faces, np.int64))
 
 
 def _from_own_axes(path: Path, vertices: np.ndarray, axes: list[np.ndarray]) -> np.ndarray:
@@ -75,23 +74,37 @@ def load_gifti(path: Path, in_space: bool = False) -> Loaded:
     """Load a GIFTI surface with the coordinates in the file or, if `in_space`, with scanner coordinates."""
     library = optional("nibabel")
     with reading(path, "a readable GIFTI surface"):
-        content = gzip.decompress(path.read_bytes()) if path.suffix.lower() == ".gz" else path.read_bytes()
+        content = content_of(path)
         # nibabel would loop over any declared number of axes, such as a billion.
         axes = [int(n) for n in re.findall(rb"Dimensionality\s*=\s*[\"'](\d+)", content)]
         if max(axes, default=0) > _AXES:
             raise ValueError(f"got an array of {max(axes)} axes; expected at most {_AXES}")
         image = library.gifti.GiftiImage.from_bytes(content)
         arrays_of_kinds = [image.get_arrays_from_intent(f"NIFTI_INTENT_{kind}") for kind in ("POINTSET", "TRIANGLE")]
-        if [len(arrays) for arrays in arrays_of_kinds] != [1, 1]:
+        if not all(arrays_of_kinds):
             numbers = " and ".join(str(len(arrays)) for arrays in arrays_of_kinds)
             raise ValueError(f"got {numbers} arrays of points and of triangles; expected one of each")
+    for kind, arrays in zip(("sets of points", "sets of triangles"), arrays_of_kinds, strict=True):
+        if len(arrays) > 1:
+            named = ", ".join(_name(array) or f"number {i} without a name" for i, array in enumerate(arrays, 1))
+            raise ValueError(
+                f"{path}: got {len(arrays)} {kind} ({named}); expected one. Write each surface to a file of its own"
+            )
+    with reading(path, "a readable GIFTI surface"):
         vertices, faces = (np.asarray(arrays[0].data) for arrays in arrays_of_kinds)
         if vertices.ndim != 2 or faces.ndim != 2 or faces.dtype.kind not in "iu":
             raise ValueError(f"got shapes {vertices.shape}, {faces.shape} ({faces.dtype}); expected (V, 3), (n, 3)")
     vertices = vertices.astype(np.float64)
     if in_space:
         vertices = _in_space(path, vertices, arrays_of_kinds[0][0])
-    return Loaded(vertices, faces.astype(np.int64), {})
+    return Loaded(vertices, faces.astype(np.int64))
+
+
+def _name(array: Any) -> str:
+    """Return the metadata of a GIFTI array that describe its surface."""
+    told = dict(array.meta)
+    keys = ("Name", "AnatomicalStructurePrimary", "AnatomicalStructureSecondary", "GeometricType")
+    return " ".join(str(told[key]) for key in keys if told.get(key))
 
 
 # Workbench declares the coordinates of every file as coordinates of an atlas. Coordinates in an atlas or in an unknown

@@ -427,7 +427,7 @@ def _numbers(path: str | os.PathLike[str], *, may_be_nan: bool = False) -> Float
     file = existing(path)
     with reading(file, "a table of numbers"), warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # NumPy warns if a table is empty
-        numbers = np.loadtxt(file, dtype=np.float64)
+        numbers = np.loadtxt(file, dtype=np.float64, encoding="utf-8-sig")
         if not numbers.size or not (may_be_nan or np.isfinite(numbers).all()):
             raise ValueError("got no numbers, or NaN or infinite ones; expected finite numbers")
     return numbers

@@ -14,12 +14,14 @@ from hks_jax.domain.components import as_mask
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.io.formats import IMAGES, format_of
 from hks_jax.io.tables import read_table
-from hks_jax.io.volume import TensorVolume, corners, require_position
+from hks_jax.io.volume import TensorVolume, corners, mask_in_file, require_position
 from hks_jax.storage import existing, reading
 
 
 def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) -> Bool[np.ndarray, "*shape"]:
     """Read a mask of zeros and ones from NIfTI, MRtrix, NRRD, ``.npy``, or the array ``mask`` of an ``.npz``.
+
+    Zeros and one larger number, such as 255, are also a mask; a warning reports the number.
 
     Args:
         path: the file.
@@ -27,7 +29,8 @@ def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) ->
 
     Raises:
         FileNotFoundError: the file does not exist.
-        ValueError: the kind of file is unknown, a value is not 0 or 1, or the mask is displaced from the image.
+        ValueError: the kind of file is unknown, there are other values, such as fractions, or the mask is displaced
+            from the image.
         ImportError: nibabel (for NIfTI) or pynrrd (for NRRD) is missing.
 
     Examples:
@@ -38,7 +41,7 @@ def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) ->
     name = os.fspath(path)
     values, place = _image(name, affine, IMAGES)
     require_position(name, place, affine, values.shape)
-    return as_mask(name, values)
+    return mask_in_file(name, values)
 
 
 def mask_on(

@@ -4,9 +4,10 @@ import json
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -17,6 +18,7 @@ from hks_jax.domain.simplicial_mesh import SimplicialMesh, SurfaceMesh, TetMesh
 from hks_jax.domain.triangulation import Triangulation
 from hks_jax.io import cortex
 from hks_jax.io.mesh_formats import Loaded, load_obj, load_off, polygonal, through_meshio
+from hks_jax.io.ply import load_ply
 from hks_jax.io.tables import write_json
 from hks_jax.io.vtk_image import holds_dataset
 from hks_jax.optional import optional
@@ -35,11 +37,11 @@ _THIN = 1e-7
 def read_mesh(path: str | os.PathLike[str], *, clean: bool = False, in_space: bool = False) -> SurfaceMesh | TetMesh:
     """Read a mesh of tetrahedra or, if the file has none, of triangles.
 
-    meshio reads ``.vtk``, ``.vtu``, Gmsh's ``.msh``, ``.ply`` and ``.stl``; VTK reads polygonal data in ``.vtk`` and
+    meshio reads ``.vtk``, ``.vtu``, Gmsh's ``.msh`` and ``.stl``; VTK reads polygonal data in ``.vtk`` and
     ``.vtp``; nibabel reads GIFTI (``.gii``) and FreeSurfer's surfaces (``lh.white``, …, recognised by their first
-    bytes). The formats ``.obj`` and ``.off`` need no library.
+    bytes). The formats ``.ply``, ``.obj`` and ``.off`` need no library.
 
-    Quadrilaterals are cut into triangles, as are all polygons in polygonal data, OBJ and OFF. Vertices keep their
+    Quadrilaterals are cut into triangles, as are all polygons in polygonal data, PLY, OBJ and OFF. Vertices keep their
     order. In STL, coincident corners of triangles become one vertex. Cells of lower dimension beside tetrahedra are
     ignored. A warning reports coincident vertices, as at the seams of a texture, because the surface is torn there.
 
@@ -81,23 +83,27 @@ def read_mesh(path: str | os.PathLike[str], *, clean: bool = False, in_space: bo
 
 
 def read_mesh_arrays(
-    path: str | os.PathLike[str], *, clean: bool = False
-) -> dict[str, Float[np.ndarray, "V *components"]]:
-    """Read the named arrays at the vertices of a mesh, such as tensors or the signatures that `save` writes.
+    path: str | os.PathLike[str], *, clean: bool = False, at: Literal["vertices", "faces", "cells"] = "vertices"
+) -> dict[str, Float[np.ndarray, "n *components"]]:
+    """Read the named arrays at the vertices or the cells of a mesh, such as tensors or the signatures of `save`.
 
-    Only ``.vtk``, ``.vtu``, ``.vtp``, ``.msh`` and ``.ply`` have arrays at vertices; other files give an empty result.
+    Only ``.vtk``, ``.vtu``, ``.vtp``, ``.msh`` and ``.ply`` have arrays; other files give an empty result. Arrays at
+    the cells of polygonal data (``.vtp``, and polygonal data in ``.vtk``) are not read.
 
     Args:
         path: the file.
         clean: whether to clean the mesh, as for `read_mesh`. The arrays follow the numbering of the cleaned mesh.
+        at: ``"vertices"``; or the cells of `read_mesh`, which are ``"faces"`` for triangles and ``"cells"`` for
+            tetrahedra. All triangles of a polygon have the polygon's values.
 
     Returns:
-        The real arrays in floating point, (V,) or (V, components). ``array.reshape(-1, 3, 3)`` gives tensors of nine
-        components the shape (V, 3, 3).
+        The real arrays in floating point, (n,) or (n, components). ``array.reshape(-1, 3, 3)`` gives tensors of nine
+        components the shape (n, 3, 3). `SurfaceMesh.from_tensors` and `TetMesh.from_tensors` take such tensors with the
+        same `at`.
 
     Raises:
         FileNotFoundError: the file does not exist.
-        ValueError: the file is not a mesh, or unreadable.
+        ValueError: the file is not a mesh, or unreadable, or has no such cells.
         ImportError: meshio, nibabel, or for polygonal data VTK, is missing.
 
     Examples:
@@ -106,7 +112,16 @@ def read_mesh_arrays(
         >>> np.allclose(hj.io.read_mesh_arrays(path)["height"], sphere.vertices[:, 2], atol=1e-6)
         True
     """
-    return _load(path, clean)[0].arrays
+    arrays = arrays_by_place(path, clean)
+    if at not in arrays:
+        raise ValueError(f"at: got {at!r}, but the places of arrays in {os.fspath(path)} are {', '.join(arrays)}")
+    return arrays[at]
+
+
+def arrays_by_place(path: str | os.PathLike[str], clean: bool = False) -> dict[str, dict[str, np.ndarray]]:
+    """Return the arrays at the ``"vertices"``, and at the ``"faces"`` of a surface or the ``"cells"`` of a solid."""
+    loaded = _load(path, clean)[0]
+    return {"vertices": dict(loaded.arrays), WORDS[loaded.cells.shape[1] - 1].argument: dict(loaded.of_cells)}
 
 
 def is_mesh(path: Path) -> bool:
@@ -143,6 +158,8 @@ def _load(path: str | os.PathLike[str], clean: bool, in_space: bool = False) -> 
         loaded = load_obj(file)
     elif name.endswith(".off"):
         loaded = load_off(file)
+    elif name.endswith(".ply"):
+        loaded = load_ply(file)
     elif name.endswith(READ):
         loaded = through_meshio(file)
     elif cortex.is_freesurfer(file):
@@ -200,32 +217,39 @@ def _cleaned(loaded: Loaded) -> tuple[Loaded, str]:
 
     finite = np.isfinite(loaded.vertices).all(axis=1)
     say(int((~finite).sum()), "vertices with NaN or infinite coordinates removed")
-    cells = first[loaded.cells[finite[loaded.cells].all(axis=1)]]
+    kept = np.flatnonzero(finite[loaded.cells].all(axis=1))
+    cells = first[loaded.cells[kept]]
     say(n_cells - len(cells), f"{words.simplices} at such vertices removed")
     say(int((first != np.arange(len(first))).sum()), "vertices merged with a coincident vertex")
     flat = (np.diff(np.sort(cells, axis=1), axis=1) == 0).any(axis=1)
     if cells.shape[1] == 3:
-        cells, flipped = _without_thin(loaded.vertices, cells[~flat])
+        cells, gone, flipped = _without_thin(loaded.vertices, cells[~flat])
+        kept = kept[~flat][~gone]
         say(flipped, "edges through a vertex flipped")
     else:
         inverted = signed_measure(loaded.vertices, cells)[0] < 0
         say(int(inverted.sum()), f"{words.simplices} of negative orientation reversed")
         cells = np.where(inverted[:, None], cells[:, [1, 0, 2, 3]], cells)[~flat]
+        kept = kept[~flat]
     sound = signed_measure(loaded.vertices, cells)[1]
     say(int(flat.sum() + (~sound).sum()), f"{words.simplices} without {words.measure} removed")
     _, once = np.unique(np.sort(cells[sound], axis=1), axis=0, return_index=True)
     say(int(sound.sum()) - len(once), f"duplicate {words.simplices} removed")
-    cells = cells[sound][np.sort(once)]
+    cells, kept = cells[sound][np.sort(once)], kept[sound][np.sort(once)]
     used, numbered = np.unique(cells, return_inverse=True)
     say(int((finite & (first == np.arange(len(first)))).sum()) - len(used), f"vertices without a {words.one} removed")
     arrays = {name: values[used] for name, values in loaded.arrays.items()}
-    return Loaded(loaded.vertices[used], numbered.reshape(cells.shape), arrays), "; ".join(done)
+    of_cells = {name: values[kept] for name, values in loaded.of_cells.items()}
+    return Loaded(loaded.vertices[used], numbered.reshape(cells.shape), arrays, of_cells), "; ".join(done)
 
 
 def _without_thin(
     vertices: Float[np.ndarray, "V 3"], cells: Int[np.ndarray, "n 3"]
-) -> tuple[Int[np.ndarray, "m 3"], int]:
-    """Flip the longest edge of each triangle of nearly zero height, or remove such a triangle at a boundary."""
+) -> tuple[Int[np.ndarray, "m 3"], Bool[np.ndarray, " n"], int]:
+    """Flip the longest edge of each triangle of nearly zero height, or remove such a triangle at a boundary.
+
+    Returns the triangles, which of the given triangles are removed, and the number of flips.
+    """
     cells, gone, flipped = cells.copy(), np.zeros(len(cells), bool), 0
     corners = vertices[cells]
     lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
@@ -243,4 +267,4 @@ def _without_thin(
             flipped += 1
         elif not len(beside):
             gone[cell] = True
-    return cells[~gone], flipped
+    return cells[~gone], gone, flipped

@@ -3,36 +3,52 @@
 In a damaged file, meshio may omit points or cells without an error, so this module checks their numbers.
 """
 
+import math
 import re
+import tempfile
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.io.vtk_image import load as through_vtk
 from hks_jax.optional import optional
 from hks_jax.storage import reading
 
 
 class Loaded(NamedTuple):
-    """The content of a file: vertices, triangles or tetrahedra, and arrays at the vertices."""
+    """The content of a file: vertices, triangles or tetrahedra, and the arrays at both."""
 
     vertices: Float[np.ndarray, "V 3"]
     cells: Int[np.ndarray, "n corners"]
-    arrays: dict[str, Float[np.ndarray, "V *components"]]
+    arrays: Mapping[str, Float[np.ndarray, "V *components"]] = MappingProxyType({})
+    of_cells: Mapping[str, Float[np.ndarray, "n *components"]] = MappingProxyType({})
 
 
 def through_meshio(path: Path) -> Loaded:
     """Load triangles or tetrahedra through meshio; raise ValueError for other cells and damaged files."""
     suffix = path.suffix.lower()
     library = optional("meshio")
+    if suffix == ".vtu" and (
+        found := re.search(rb"<VTKFile[^>]*\bcompressor\s*=\s*[\"'](vtkLZ4\w*)", path.read_bytes())
+    ):
+        raise ValueError(
+            f"{path}: the data are compressed by {found[1].decode()}, which meshio does not read. Write the file with "
+            "zlib compression (vtkZLibDataCompressor) or without compression"
+        )
     # meshio computes the length of a binary STL file from its number of triangles, which overflows for STL text.
     with reading(path, f"a mesh that meshio can read as {suffix}"), np.errstate(over="ignore"):
         content = path.read_bytes()
         declared = _declared(content, suffix)
-        # The reader of the format is called, because meshio.read ends the process if it cannot read a file.
-        read = getattr(library, "gmsh" if suffix == ".msh" else suffix[1:]).read(str(path))
+        pieces = _pieces(content) if suffix == ".vtu" else []
+        if suffix == ".msh":
+            read = _gmsh(path, library, content)
+        else:
+            read = _joined(library, content, pieces) if len(pieces) > 1 else _read(library, content, suffix)
         _compare(content, suffix, declared, read)
         points = np.asarray(read.points, np.float64)
         blocks = [block.data for block in read.cells if block.type == "tetra"]
@@ -41,35 +57,119 @@ def through_meshio(path: Path) -> Loaded:
         if points.ndim != 2 or points.shape[1] not in (2, 3):
             raise ValueError(f"got points of shape {points.shape}; expected (V, 2) or (V, 3)")
         points = np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
-        arrays = _real_arrays(read.point_data, len(points))
+        arrays = real_arrays(read.point_data, len(points))
+        which = [i for i, block in enumerate(read.cells) if block.type == "tetra"]
+        which = which or [i for i, block in enumerate(read.cells) if block.type in ("triangle", "quad")]
+        of_blocks = {name: [np.asarray(parts[i]) for i in which] for name, parts in read.cell_data.items()}
     others = {block.type for block in read.cells} - {"tetra", "triangle", "quad", "line", "vertex"}
     if others:
         raise ValueError(
             f"{path}: got {', '.join(sorted(others))} cells; expected triangles, quadrilaterals or tetrahedra"
         )
-    surfaces = [block.data for block in read.cells if block.type in ("triangle", "quad")]
-    blocks = blocks or [fans(path, points, cells).reshape(-1, 3) for cells in surfaces]
-    if not blocks:
+    if not which:
         raise ValueError(f"{path}: the mesh has no triangles and no tetrahedra; expected one of these kinds of cell")
-    return Loaded(points, np.concatenate(blocks).astype(np.int64), arrays)
+    parts = blocks or [fans(path, points, read.cells[i].data) for i in which]
+    times = [1 if blocks else each.shape[1] for each in parts]  # a quadrilateral becomes two triangles
+    cells = np.concatenate([each.reshape(-1, 4 if blocks else 3) for each in parts]).astype(np.int64)
+    of_cells = {
+        name: np.concatenate([np.repeat(values, n, axis=0) for values, n in zip(of_parts, times, strict=True)])
+        for name, of_parts in of_blocks.items()
+    }
+    return Loaded(points, cells, arrays, real_arrays(of_cells, len(cells)))
+
+
+def _read(library: Any, content: bytes, suffix: str) -> Any:
+    """Read the content of a file by meshio, in a form that meshio supports."""
+    if suffix == ".vtk":
+        content = _with_fields(content)
+    elif suffix == ".vtu":  # for triangles and tetrahedra, the versions do not differ
+        content = re.sub(rb"(<VTKFile[^>]*\bversion\s*=\s*[\"'])2\.\d+", rb"\g<1>1.0", content, count=1)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / f"mesh{suffix}"
+        file.write_bytes(content)
+        # The reader of the format is called, because meshio.read ends the process if it cannot read a file.
+        return getattr(library, "gmsh" if suffix == ".msh" else suffix[1:]).read(str(file))
+
+
+def _gmsh(path: Path, library: Any, content: bytes) -> Any:
+    """Read a Gmsh file; without its arrays at cells, with a warning, if meshio cannot read them.
+
+    meshio 5.3 cannot read arrays at the cells of several kinds, or at some of the cells.
+    """
+    try:
+        return _read(library, content, ".msh")
+    except (Exception, SystemExit):
+        bare = re.sub(rb"^\$ElementData\b.*?^\$EndElementData\b", b"", content, flags=re.DOTALL | re.MULTILINE)
+        if bare == content:
+            raise
+        read = _read(library, bare, ".msh")
+    warn_of_accuracy(
+        f"{path}: the arrays at the cells ($ElementData) are not read, because meshio reads them only for cells of one "
+        "kind with values at every cell. To use them, write the mesh as .vtu",
+        UserWarning,
+    )
+    return read
+
+
+_ATTRIBUTE = re.compile(rb"^(TENSORS6|NORMALS)[ \t]+(\S+)[ \t]+(\w+)[ \t]*\r?\n", re.MULTILINE | re.IGNORECASE)
+_DATA = re.compile(rb"^(?:POINT|CELL)_DATA[ \t]+(\d+)", re.MULTILINE | re.IGNORECASE)
+
+
+def _with_fields(content: bytes) -> bytes:
+    """Return a legacy VTK file with tensors of six components and normals as field data, because meshio reads these."""
+
+    def as_field(found: re.Match[bytes]) -> bytes:
+        count = _DATA.findall(content, 0, found.start())[-1]
+        components = b"6" if found[1].upper() == b"TENSORS6" else b"3"
+        return b"FIELD attributes 1\n" + b" ".join([found[2], components, count, found[3]]) + b"\n"
+
+    return _ATTRIBUTE.sub(as_field, content)
+
+
+def _pieces(content: bytes) -> list[re.Match[bytes]]:
+    """Return the pieces of a VTU file."""
+    return list(re.finditer(rb"<Piece\b.*?</Piece>", content.partition(b"<AppendedData")[0], re.DOTALL))
+
+
+def _joined(library: Any, content: bytes, pieces: list[re.Match[bytes]]) -> Any:
+    """Read a VTU file of several pieces.
+
+    meshio 5.3 returns the points of all pieces, but only the cells of the last piece. Therefore, the file is read once
+    for each piece, which is moved behind the others.
+    """
+    sizes = [int(re.findall(_COUNTS[".vtu"][0], piece[0])[0]) for piece in pieces]
+    begins, blocks, of_blocks = np.cumsum([0, *sizes]), [], []
+    for i, piece in enumerate(pieces):
+        others = b"".join(other[0] for other in pieces if other is not piece)
+        whole = _read(library, content[: pieces[0].start()] + others + piece[0] + content[pieces[-1].end() :], ".vtu")
+        for j, block in enumerate(whole.cells):
+            blocks.append((block.type, block.data - (begins[-1] - sizes[i]) + begins[i]))
+            of_blocks.append({name: parts[j] for name, parts in whole.cell_data.items()})
+    names = [name for name in whole.cell_data if all(name in each for each in of_blocks)]
+    of_cells = {name: [each[name] for each in of_blocks] for name in names}
+    return library.Mesh(whole.points, blocks, whole.point_data, of_cells)
 
 
 _GMSH = re.compile(rb"\s*(?:\$Comments.*?\$EndComments\s*)?\$MeshFormat\s+(\S+)\s+([01])\s+([48])\b", re.DOTALL)
 _COUNTS = {
-    ".ply": (rb"element\s+vertex\s+(-?\d+)", rb"element\s+face\s+(-?\d+)"),
     ".vtk": (rb"\bPOINTS\s+(-?\d+)", rb"\bCELL_TYPES\s+(-?\d+)"),
     ".vtu": (rb"NumberOfPoints\s*=\s*[\"'](-?\d+)", rb"NumberOfCells\s*=\s*[\"'](-?\d+)"),
 }
 """Patterns of the declared numbers of points and cells in each format. For .stl, meshio checks the file's length."""
 
-_PLY = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
-"""The size in bytes of each PLY type that has a C name. PLY's other types, such as int32, have NumPy's names."""
+
+_GRID = re.compile(rb"DATASET\s+(?:STRUCTURED|RECTILINEAR)_GRID\s+DIMENSIONS\s+(\d+\s+\d+\s+\d+)", re.IGNORECASE)
+"""The pattern of the numbers of points along the axes of legacy grids, whose cells are not listed."""
 
 
 def _declared(content: bytes, suffix: str) -> tuple[int, ...]:
     """Return the declared numbers of points and cells, and for Gmsh also the largest tag of a point."""
     patterns = _COUNTS.get(suffix, ())
     declared = tuple(sum(map(int, re.findall(pattern, content))) for pattern in patterns)
+    grid = _GRID.search(content) if suffix == ".vtk" else None
+    if grid is not None:
+        sizes = [int(size) for size in grid[1].split()]
+        declared = (math.prod(sizes), math.prod(size - 1 for size in sizes if size > 1))
     if suffix == ".msh":
         declared = _declared_by_gmsh(content)
     if max(declared, default=0) > 8 * len(content):
@@ -78,7 +178,7 @@ def _declared(content: bytes, suffix: str) -> tuple[int, ...]:
 
 
 def _compare(content: bytes, suffix: str, declared: tuple[int, ...], mesh: Any) -> None:
-    """Raise ValueError unless the points, the cells and, in .vtk and .ply, the length of their data are as declared."""
+    """Raise ValueError unless the points, the cells and, in .vtk, the number of corners are as declared."""
     counts = (len(mesh.points), sum(len(block.data) for block in mesh.cells))
     if declared and declared[:2] != counts:
         what = "the file declares {} points and {} cells, but has {} and {}"
@@ -89,28 +189,6 @@ def _compare(content: bytes, suffix: str, declared: tuple[int, ...], mesh: Any) 
         listed = int(lists[2]) - (0 if re.match(rb"# vtk DataFile Version [5-9]", content) else counts[1])
         if listed != corners:  # if a cell's type is wrong, meshio omits corners
             raise ValueError(f"the file lists {listed} corners, but cells of the declared types have {corners}")
-    if suffix == ".ply":
-        _compare_ply(content, mesh)
-
-
-def _compare_ply(content: bytes, mesh: Any) -> None:
-    head, _, body = re.split(rb"(\bend_header\s*?\n)", content, maxsplit=1)
-    ascii_ = b"format ascii" in head
-    of_points, _, of_cells = head.partition(b"element face")
-    lists = re.findall(rb"property\s+list\s+(\w+)\s+(\w+)", of_cells)
-    if len(lists) != 1:
-        return  # the length of the faces' data is known only if each face has one list, of its corners
-
-    def size(name: bytes) -> int:
-        return 1 if ascii_ else _PLY.get(name.decode()) or np.dtype(name.decode()).itemsize
-
-    length, index = map(size, lists[0])
-    scalar = re.compile(rb"property\s+(?!list)(\w+)")
-    point, cell = (sum(map(size, scalar.findall(part))) for part in (of_points, of_cells))
-    of_blocks = (len(b.data) * (length + index * b.data.shape[1] + cell) for b in mesh.cells)
-    wanted, got = len(mesh.points) * point + sum(of_blocks), len(body.split() if ascii_ else body)
-    if wanted != got:
-        raise ValueError(f"got {got} {'words' if ascii_ else 'bytes'} of points and cells; expected {wanted}")
 
 
 def _declared_by_gmsh(content: bytes) -> tuple[int, int, int]:
@@ -153,16 +231,16 @@ def polygonal(path: Path) -> Loaded:
             raise ValueError(f"got {data['kind']}; expected vtkPolyData")
         points = data["points"].astype(np.float64)
     arrays = {key.removeprefix("point:"): values for key, values in data.items() if key.startswith("point:")}
-    return Loaded(points, data["faces"].astype(np.int64), _real_arrays(arrays, len(points)))
+    return Loaded(points, data["faces"].astype(np.int64), real_arrays(arrays, len(points)))
 
 
-def _real_arrays(named: dict[str, Any], n_points: int) -> dict[str, Float[np.ndarray, "V *components"]]:
-    """Return the real arrays that have one row per point, without Gmsh's tags."""
+def real_arrays(named: Mapping[str, Any], n: int) -> dict[str, Float[np.ndarray, "n *components"]]:
+    """Return the real arrays with n rows, one per vertex or cell, without Gmsh's tags."""
     arrays = {key: np.asarray(values) for key, values in named.items() if not key.startswith("gmsh:")}
     return {
         key: values.astype(np.result_type(values.dtype, np.float32))
         for key, values in arrays.items()
-        if values.ndim and len(values) == n_points and values.dtype.kind in "fiub"
+        if values.ndim and len(values) == n and values.dtype.kind in "fiub"
     }
 
 
@@ -225,7 +303,7 @@ def load_obj(file: Path) -> Loaded:
                     raise ValueError(f"line {number}: got the face {' '.join(words[1:])}; expected 3 vertices or more")
                 # Vertices are numbered from 1. A negative number counts backwards from the last vertex read so far.
                 polygons.append([corner - 1 if corner > 0 else len(vertices) + corner for corner in corners])
-    return _triangulated(file, vertices, polygons)
+    return _by_size(file, vertices, polygons)
 
 
 def load_off(file: Path) -> Loaded:
@@ -253,15 +331,31 @@ def load_off(file: Path) -> Loaded:
             # In the line of a face, a colour may follow the corners: an index, or three or four numbers.
             if len(corners) != int(row[0]) or len(corners) < 3 or len(row) - 1 - len(corners) > 4:
                 raise ValueError(f"got the face {' '.join(row)[:60]}; expected n, n corners, an optional colour")
-    return _triangulated(file, vertices, polygons)
+    return _by_size(file, vertices, polygons)
 
 
-def _triangulated(file: Path, vertices: list[list[float]], polygons: list[list[int]]) -> Loaded:
+def triangulated(
+    file: Path, points: Float[np.ndarray, "V 3"], polygons: list[tuple[Int[np.ndarray, " _"], Int[np.ndarray, "_ _"]]]
+) -> tuple[Loaded, Int[np.ndarray, " triangles"]]:
+    """Cut polygons into triangles, and return the triangles in the order of the polygons, with their polygons' numbers.
+
+    Each entry of `polygons` has the numbers of polygons with n corners, and their corners.
+    """
     if not polygons:
         raise ValueError(f"{file}: the mesh has no triangles; expected at least one face")
-    points, order, triangles = np.array(vertices, np.float64).reshape(-1, 3), [], []
-    for size in {len(polygon) for polygon in polygons}:
-        which = np.flatnonzero([len(polygon) == size for polygon in polygons])
-        order.append(np.repeat(which, size - 2))
-        triangles.append(fans(file, points, np.array([polygons[i] for i in which]), which).reshape(-1, 3))
-    return Loaded(points, np.concatenate(triangles)[np.argsort(np.concatenate(order), kind="stable")], {})
+    triangles = [fans(file, points, corners, which) for which, corners in polygons]
+    polygon = np.concatenate(
+        [np.repeat(which, each.shape[1]) for (which, _), each in zip(polygons, triangles, strict=True)]
+    )
+    order = np.argsort(polygon, kind="stable")
+    return Loaded(points, np.concatenate([each.reshape(-1, 3) for each in triangles])[order]), polygon[order]
+
+
+def _by_size(file: Path, vertices: list[list[float]], polygons: list[list[int]]) -> Loaded:
+    """Return the triangles of polygons."""
+    sizes = np.array([len(polygon) for polygon in polygons], np.int64)
+    groups = [
+        (which, np.array([polygons[i] for i in which]))
+        for which in map(np.flatnonzero, sizes == np.unique(sizes)[:, None])
+    ]
+    return triangulated(file, np.array(vertices, np.float64).reshape(-1, 3), groups)[0]

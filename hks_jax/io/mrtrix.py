@@ -4,7 +4,6 @@ The header has lines ``key: value`` up to ``END``. The key ``file`` gives the of
 their order (https://mrtrix.readthedocs.io/en/latest/getting_started/image_data.html).
 """
 
-import gzip
 import math
 
 import numpy as np
@@ -12,7 +11,7 @@ from jaxtyping import Float
 
 from hks_jax.io.tensor_order import FRAMES, matrices
 from hks_jax.io.volume import Format, TensorVolume, placed
-from hks_jax.storage import existing, reading
+from hks_jax.storage import content_of, existing, reading
 
 _MAGIC = b"mrtrix image"
 _KINDS = {"Int": "i", "UInt": "u", "Float": "f"}
@@ -22,7 +21,7 @@ def _load(name: str) -> tuple[np.ndarray, Float[np.ndarray, "4 4"], str]:
     """Return the voxel values (axes as in the header), the affine to scanner coordinates, and the unit of length."""
     file = existing(name)
     with reading(file, "a readable MRtrix image (.mif)"):
-        content = gzip.decompress(file.read_bytes()) if file.name.lower().endswith(".gz") else file.read_bytes()
+        content = content_of(file)
         header, offset = _header(content)
         shape = tuple(int(n) for n in header["dim"][0].split(","))
         if min(shape) < 1 or len(shape) < 3:

@@ -1,6 +1,5 @@
 """Read and write NIfTI through the optional library nibabel; tensors may be in six images of one component each."""
 
-import gzip
 import json
 import math
 import os
@@ -12,14 +11,15 @@ from typing import Any
 
 import numpy as np
 
+from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.io.plausibility import OPEN_FRAME
 from hks_jax.io.repair import require_symmetric
 from hks_jax.io.tables import write_json
 from hks_jax.io.tensor_order import FRAMES, ORDERS, matrices, pack
 from hks_jax.io.units import by_axis
-from hks_jax.io.volume import Format, TensorVolume, corners, describe_tensors, images_of, own_record, placed
+from hks_jax.io.volume import AXES, Format, TensorVolume, corners, describe_tensors, images_of, own_record, placed
 from hks_jax.optional import optional
-from hks_jax.storage import atomic_path, existing, reading
+from hks_jax.storage import atomic_path, content_of, existing, reading
 
 SUFFIXES = (".nii", ".nii.gz")
 SYMMETRIC_MATRIX = 1005
@@ -28,6 +28,8 @@ COMMENT = 6
 """NIfTI's code for a comment in an extension of the header."""
 _LENGTHS = {0: ("", 1.0), 1: ("m", 1e3), 2: ("mm", 1.0), 3: ("um", 1e-3)}
 """The unit of length for each code in NIfTI's xyzt_units, and its size in mm. Code 0, no unit, is read as mm."""
+_HEADERS_OF_2 = (b"\x1c\x02\0\0", b"\0\0\x02\x1c")
+"""The first bytes of NIfTI-2, the size of its header in both byte orders."""
 _REFERENCES = {"ijk": "voxel", "bvec": "fsl", "xyz": "world", "scanner": "world"}
 """The frame for each value of Reference in BIDS's field OrientationEncoding, including values from drafts of BIDS."""
 _COMPONENT = re.compile(r"(?:^|[_.-])(?:dt|t|d)?(xx|xy|xz|yy|yz|zz)(?=[_.])", re.IGNORECASE)
@@ -43,16 +45,33 @@ def load(name: str) -> Any:
     """Open a NIfTI image, and check its length and the checksum of a compressed file."""
     nib, file = optional("nibabel"), existing(name)
     with reading(file, "a readable NIfTI image"):
-        image, length = nib.load(file), file.stat().st_size
-        if file.name.lower().endswith(".gz"):
-            with gzip.open(file) as stream:
-                content = stream.read()
-            image, length = type(image).from_bytes(content), len(content)
+        with open(file, "rb") as stream:
+            compressed = stream.read(2) == b"\x1f\x8b"
+        if compressed or file.name.lower().endswith(".gz"):  # the content counts, because nibabel goes by the name
+            content = content_of(file)
+            kind = nib.Nifti2Image if content[:4] in _HEADERS_OF_2 else nib.Nifti1Image
+            image, length = kind.from_bytes(content), len(content)
+        else:
+            image, length = nib.load(file), file.stat().st_size
         data = image.dataobj
         declared = data.offset + math.prod(image.shape) * data.dtype.itemsize
         if declared != length:
             raise ValueError(f"got {length} bytes; expected {declared} for {data.dtype} of shape {image.shape}")
+        _warn_of_zero_spacing(name, image)
     return image
+
+
+def _warn_of_zero_spacing(name: str, image: Any) -> None:
+    """Warn if the header has a voxel size of zero, which nibabel replaces by 1, and no sform gives the voxel sizes."""
+    if int(image.header["sform_code"]) > 0:
+        return
+    with image.file_map["image"].get_prepare_fileobj("rb") as stream:
+        stored = type(image.header).from_fileobj(stream, check=False)["pixdim"][1:4]
+    if axes := ", ".join(axis for axis, size in zip(AXES, stored[: len(image.shape)], strict=False) if size == 0):
+        warn_of_accuracy(
+            f"{name}: the header gives the voxel size 0 along {axes} and no sform; the size 1 is assumed. Correct the "
+            "header's pixdim"
+        )
 
 
 def voxels(name: str, image: Any) -> np.ndarray:
@@ -142,9 +161,6 @@ def read_tensors(name: str, order: str | None, frame: str | None, image: Any = N
     frame = frame or declared_frame or FRAMES[found.order]
     volume = placed(name, found, frame, affine, unit=record.get("unit", ""))
     notes += placement_notes(image)
-    axes = affine[:3, :3] / volume.spacing
-    if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-3:
-        notes.append("the affine's axes are not orthogonal, and the shear is ignored")
     stored = np.linalg.norm(np.asarray(image.affine, np.float64)[:3, :3], axis=0)
     if length_unit not in ("", "mm"):
         notes.append(f"voxel sizes {by_axis(stored)} converted from {length_unit}, which the file declares, to mm")

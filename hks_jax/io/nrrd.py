@@ -13,7 +13,7 @@ from jaxtyping import Float
 from hks_jax.io.repair import require_symmetric
 from hks_jax.io.tensor_order import matrices, nearest_rotation, pack, to_voxel_axes
 from hks_jax.io.units import millimetres
-from hks_jax.io.volume import Format, TensorVolume, describe_tensors, images_of, own_record
+from hks_jax.io.volume import Format, TensorVolume, describe_tensors, images_of, own_record, shear_notes
 from hks_jax.optional import optional
 from hks_jax.storage import atomic_path, existing, reading
 
@@ -162,6 +162,7 @@ def _read_tensors(name: str, order: str | None, frame: str | None, confidence: f
     place = _placement(name, header, domain)
     spacing = np.linalg.norm(place.directions, axis=0)
     affine = place.affine
+    notes += shear_notes(place.directions)
     tensors, frame = _to_voxel_axes(name, found.tensors, frame, place, notes)
     if affine is not None and place.signs is None:
         space = f"the axes of the file's space, {header.get('space', 'unnamed')!r}"

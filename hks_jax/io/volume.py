@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -12,13 +13,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from hks_jax import __version__
+from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.arrays import describe_array
 from hks_jax.checks import require_real
+from hks_jax.domain.components import as_mask
 from hks_jax.domain.grid import Grid, per_axis
 from hks_jax.io.tensor_order import InvalidByOrder, Matrices, to_voxel_axes
 from hks_jax.uncertainty.noise import TensorNoise
 
 AXES = "xyz"
+_ROUNDED_ONE = 0.999
+"""The number above which the largest value in a mask is 1 up to the rounding of a scaled image, or more."""
 
 
 @dataclass(frozen=True)
@@ -246,11 +251,39 @@ def placed(name: str, found: Matrices, frame: str, affine: Float[np.ndarray, "4 
         affine=affine,
         order=found.order,
         frame=frame,
-        notes=(found.note(frame),),
+        notes=(*shear_notes(affine[:3, :3]), found.note(frame)),
         source=name,
         invalid_by_order=found.invalid,
         **{"length_unit": "mm", **known},
     )
+
+
+def shear_notes(directions: Float[np.ndarray, "d d"]) -> list[str]:
+    """Return a note if the voxel axes (the columns) are not orthogonal, because grids have orthogonal axes."""
+    axes = directions / np.linalg.norm(directions, axis=0)
+    cosine = np.abs(axes.T @ axes - np.eye(len(axes))).max()
+    if cosine <= 1e-3:
+        return []
+    angle = math.degrees(math.acos(min(cosine, 1.0)))
+    return [
+        f"the voxel axes are not orthogonal (two meet at {angle:.3g}°), and the shear is ignored: the computation "
+        "takes them as orthogonal. Resample the tensors to orthogonal axes"
+    ]
+
+
+def mask_in_file(name: str, values: np.ndarray) -> Bool[np.ndarray, "*shape"]:
+    """Return the mask of zeros and one other number, such as 255, in a file; warn unless it is 1.
+
+    Raises:
+        ValueError: there are other values, or a fraction, which may be a probability.
+    """
+    values = np.asarray(values)
+    if values.dtype != bool and values.size and values.dtype.kind in "fiu":
+        high = values.max()
+        if high > _ROUNDED_ONE and high != 1 and np.isin(values, (0, high)).all():
+            warn_of_accuracy(f"{name}: the values are 0 and {high:g}; {high:g} is read as inside the mask", UserWarning)
+            return values == high
+    return as_mask(name, values)
 
 
 def corners(shape: tuple[int, ...]) -> Int[np.ndarray, "8 4"]:

@@ -14,9 +14,8 @@ from urllib.parse import quote
 
 import numpy as np
 
-from hks_jax.domain.components import as_mask
 from hks_jax.io.tensor_order import matrices, nearest_rotation
-from hks_jax.io.volume import Format, TensorVolume, describe_tensors, placed
+from hks_jax.io.volume import Format, TensorVolume, describe_tensors, mask_in_file, placed
 from hks_jax.optional import optional
 from hks_jax.storage import atomic_path, existing, load_npz, reading
 
@@ -80,7 +79,7 @@ def _read_tensors(name: str, order: str | None, frame: str | None, array: str | 
     affine[:3, :3] = image["direction"] * steps
     affine[:3, 3] = image["origin"] + affine[:3, :3] @ (lower + np.where(of_cells, 0.5, 0.0))
     mask = image.get(f"{place}:mask")
-    inside = None if mask is None else as_mask(f"{name}: mask", np.ascontiguousarray(_on_grid(mask, shape)))
+    inside = None if mask is None else mask_in_file(f"{name}: mask", np.ascontiguousarray(_on_grid(mask, shape)))
     found = found._replace(tensors=_on_grid(found.tensors, shape), of=f" from {chosen!r} at the {place}s")
     volume = placed(name, found, frame or "world", affine, mask=inside, length_unit="")
     if np.array_equal(affine[:3, :3], np.diag(volume.spacing)):

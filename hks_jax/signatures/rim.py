@@ -26,7 +26,9 @@ from hks_jax.signatures.times import FREE
 from hks_jax.signatures.truncation import resolved_times
 
 _CANDIDATES = 24
+"""The number of times at which the share of free nodes is computed, to find the time at which it is a half."""
 _STEPS, _TOLERANCE = 2000, 1e-7
+"""The largest number of steps of conjugate gradients for the estimate, and their relative tolerance."""
 _ON_HOST = 1 << 28
 """The largest number of matrix entries for which the estimate is computed without compilation."""
 

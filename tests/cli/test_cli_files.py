@@ -274,8 +274,14 @@ def test_signature_of_a_solid_with_tensors_at_its_vertices(tmp_path, capsys):
     refused("--noise: got 'roughness'; expected a number", *of_tensors, "--noise", "roughness")
     refused("--metric: this option needs tensors, but without --array", "--metric", "tensor")
     refused("--interpolation: this option needs tensors", "--interpolation", "log-euclidean")
-    refused("--metric: the tensors at the vertices need a metric", "--array", "D")
-    refused("--array: got 'E'; expected one of the arrays at the vertices: D", "--array", "E", "--metric", "tensor")
+    refused("--metric: the tensors of the mesh need a metric", "--array", "D")
+    refused(
+        "--array: got 'E'; expected one of the arrays at the vertices: D; at the cells: none",
+        "--array",
+        "E",
+        "--metric",
+        "tensor",
+    )
     refused("--slice: this option is for tensors on a grid; leave it out for a mesh", "--slice", "z=1")
     refused("--boundary: got 'mirror'; expected neumann, dirichlet, mean", "--boundary", "mirror")
     refused("--array: got 'D' with 9 components", "--array", "D", "--metric", "tensor", "--order", "vtk")

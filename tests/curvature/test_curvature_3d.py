@@ -48,7 +48,8 @@ def test_spaces_of_known_curvature(name):
     metric, R, u2 = SPACES[name]
     field, t = hj.TensorField.from_function(metric, GRID), 0.3
     np.testing.assert_allclose(hj.scalar_curvature(field), R, atol=1e-12)
-    np.testing.assert_allclose(hj.scalar_curvature(nodal(field)), R, atol=0.2)
+    np.testing.assert_allclose(hj.scalar_curvature(nodal(field)), R, atol=0.6)
+    np.testing.assert_allclose(hj.scalar_curvature(nodal(field))[3:-3, 3:-3, 3:-3], R, atol=1e-3)
     if name == "hyperbolic":  # one is enough for what all share, and takes seconds to compile
         expected = (1 + R / 6 * t + u2 * t**2) / (4 * np.pi * t) ** 1.5
         np.testing.assert_allclose(hj.hks_expansion(field, [t]), np.full((1, *GRID.shape), expected), rtol=1e-11)
@@ -147,7 +148,8 @@ def test_mask_leaves_nan_where_no_stencil_fits_and_nothing_else_changes():
     masked = hj.TensorField(hj.Grid(grid.shape, grid.spacing, grid.origin, mask), tensors)
     got = np.asarray(hj.scalar_curvature(masked))
     assert np.isnan(got[~mask]).all()
-    np.testing.assert_allclose(got[mask], 6, atol=0.01)
+    np.testing.assert_allclose(got[mask], 6, atol=0.6)
+    np.testing.assert_allclose(got[9:13, 8:13, 3:13], 6, atol=1e-3)  # all rows are centred
 
 
 def test_curvature_is_differentiable():

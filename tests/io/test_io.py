@@ -233,7 +233,7 @@ def test_an_image_that_is_no_tensor_image_is_refused(tmp_path):
         ("nibabel", "t.nii", "dti"),
         ("nrrd", "t.nrrd", "nrrd"),
         ("vtkmodules.vtkIOXML", "t.vti", "vtk"),
-        ("meshio", "m.ply", "mesh"),
+        ("meshio", "m.vtu", "mesh"),
     ],
 )
 def test_of_a_missing_library_the_extra_is_named(tmp_path, monkeypatch, module, name, extra):
