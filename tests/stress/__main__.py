@@ -13,7 +13,22 @@ from benchmarks.machine import write
 
 from .harness import Tally, run, seeds
 
-KINDS = ("eigenproblems", "matrices", "gradients", "counts", "estimates", "files", "spaces", "dirty", "modes", "hang")
+KINDS = (
+    "eigenproblems",
+    "matrices",
+    "reference",
+    "gradients",
+    "counts",
+    "estimates",
+    "statistics",
+    "geometry",
+    "fits",
+    "files",
+    "spaces",
+    "dirty",
+    "modes",
+    "hang",
+)
 
 
 def main() -> int:
@@ -24,7 +39,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, help="one seed alone: the reproducer of a failure")
     parser.add_argument("--first", type=int, default=0, help="the seed to begin with")
     parser.add_argument("--number", type=int, help="how many seeds of each kind (default: as time allows)")
-    parser.add_argument("--minutes", type=float, default=15.0, help="time for each kind")
+    parser.add_argument("--minutes", type=float, default=4.5, help="time for each kind")
     parser.add_argument("--json", type=Path, help="file to keep the counts in")
     arguments = parser.parse_args()
     if unknown := set(arguments.kinds) - set(KINDS):

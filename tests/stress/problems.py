@@ -9,6 +9,8 @@ import numpy as np
 import hks_jax as hj
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 
+from .own_assembly import Form
+
 
 @dataclass(frozen=True)
 class Domain:
@@ -68,6 +70,22 @@ def random_problem(seed: int, domains: tuple[Domain, ...] = DOMAINS) -> Problem:
     grid = hj.Grid(domain.shape, domain.spacing, mask=mask, components="all")
     tensors = _tensors(kind, rng, domain.shape) * 10.0 ** rng.choice([0, 0, 0, -6, 6])
     return Problem(seed, kind, domain, hj.TensorField(grid, jnp.asarray(tensors)))
+
+
+def random_form(rng: np.random.Generator, domain: Domain, tensors: np.ndarray) -> tuple[Form, str]:
+    """Return random fields and rules, with their names."""
+    waves = np.sin(np.indices(domain.shape).T @ rng.normal(size=len(domain.shape), scale=0.3) + rng.uniform(0, 6)).T
+    natural = 1 / np.median(np.linalg.det(tensors.astype(float)) ** (1 / len(domain.shape))) / min(domain.spacing) ** 2
+    lumped, cancelling = domain.mass == "lumped", bool(rng.random() < 0.3)
+    given = {
+        "fick": rng.random() < 0.3,
+        "logarithms": rng.random() < 0.3,
+        "lumped": lumped,
+        "cancelling": cancelling and not lumped,
+        "potential": 10 ** rng.uniform(-4, 0) * natural * waves if rng.random() < 0.3 else None,
+        "density": np.exp(rng.choice([0.3, 3.0]) * waves) if rng.random() < 0.3 else None,
+    }
+    return Form(**given), ", ".join(name for name, value in given.items() if value is not None and value is not False)
 
 
 @cache
