@@ -66,7 +66,8 @@ def test_spectrum_end_to_end(sphere, tmp_path, capsys):
         assert sorted(read) == ["eigenvalues", "residuals", "weyl_counts"]
         assert np.abs(read["weyl_counts"] - np.arange(20)).max() < 4
     assert summary["eigenpairs"]["k"] == summary["settings"]["k"] == 20
-    assert sorted(summary["settings"]) == ["boundary", "components", "dtype", "interpolation", "k", "metric", "solver"]
+    settings = ["boundary", "components", "dtype", "interpolation", "k", "metric", "operator", "solver"]
+    assert sorted(summary["settings"]) == settings
     assert summary["volume"] == pytest.approx(float(hj.assemble(field).volume))
     assert min(png_size(out / "spectrum.png")) > 300
 

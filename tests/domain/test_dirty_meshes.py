@@ -243,7 +243,7 @@ def test_cleaning_says_all_that_it_did_on_the_command_line(tmp_path, capsys):
     assert "1 vertices merged" in json.loads((tmp_path / "out" / "report.json").read_text())["warnings"][0]
     with np.load(tmp_path / "out" / "hks.npz") as read:
         mesh = hj.SurfaceMesh(vertices, faces)
-        np.testing.assert_allclose(read["hks"], hj.hks(hj.eigenpairs(mesh, 6), [0.1]), rtol=1e-9)
+        np.testing.assert_allclose(read["hks"], hj.hks(hj.eigenpairs(mesh, 6), [0.1], "flat"), rtol=1e-9)
     capsys.readouterr()
     np.savez(tmp_path / "t.npz", tensors=np.broadcast_to(np.eye(2), (5, 5, 2, 2)))
     assert main(["hks", str(tmp_path / "t.npz"), "-o", str(tmp_path / "o"), "--clean"]) == 2

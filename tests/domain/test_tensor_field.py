@@ -41,7 +41,7 @@ TRACEABLE = {
     "tensors": lambda f: f.tensors,
     "tensors of the domain": lambda f: f.domain_tensors,
     "stiffness": lambda f: hj.assemble(f, "mirror").parts[0].stiffness.coefficients,
-    "curvature": hj.scalar_curvature,
+    "Laplace–Beltrami": lambda f: hj.laplace_beltrami(f, jnp.arange(72.0).reshape(8, 9)),
 }
 READERS = TRACEABLE | {
     "counts": lambda f: hj.weyl_count(hj.assemble(f), [100.0], f),

@@ -125,7 +125,7 @@ def test_smoothing_keeps_constants_and_masks():
     np.testing.assert_allclose(blurred[:, 0, mask], 3)
     np.testing.assert_allclose(blurred[1, 1, mask], u[1][mask].mean(), rtol=1e-4)
     assert np.abs(blurred[0, 1, mask] - u[1][mask]).max() < 1
-    with pytest.raises(ValueError, match=r"times: got shape \(\); expected a non-empty 1-D array"):
-        hj.gaussian_scale_space(field, 1.0, u)
+    with pytest.raises(ValueError, match=r"times: got shape \(0,\); expected a number or a non-empty 1-D array"):
+        hj.gaussian_scale_space(field, [], u)
     with pytest.raises(ValueError, match=r"functions: got shape \(18, 20\)"):
         hj.gaussian_scale_space(field, [1.0], u[0].T)
