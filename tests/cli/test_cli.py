@@ -111,6 +111,7 @@ def test_npz_end_to_end_equals_the_library(npz, tmp_path, capsys):
         assert read["eigenvalues"].shape == (25,)
 
 
+@pytest.mark.slow
 def test_ficks_operator_on_the_command_line(nifti, tmp_path, capsys):
     """Signature, saved pairs, pictures, tables, spectrum and fit; a metric beside it and curvature are refused."""
     out, again, times = tmp_path / "out", tmp_path / "again", ["--times", "6000", "20000"]

@@ -157,7 +157,7 @@ def test_error_bars_of_curvature_contain_the_truth():
     assert np.mean(z < 2) == pytest.approx(0.95, abs=0.04)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("dtype", [pytest.param(jnp.float32, marks=pytest.mark.slow), jnp.float64])
 def test_no_smooth_field_is_called_noise(dtype):
     fields = [examples.sphere_field(n, 1.0) for n in (9, 40)]
     fields += [
@@ -169,6 +169,7 @@ def test_no_smooth_field_is_called_noise(dtype):
         hj.gaussian_curvature(hj.TensorField(field.grid, field.tensors.astype(dtype)))
 
 
+@pytest.mark.slow
 def test_rounding_of_the_third_coefficient_is_told():
     """Sixth derivatives amplify rounding by 1/h⁶: on a fine grid u₃ = 4/315 is lost, on a coarse one it is exact."""
     coarse, fine = (examples.sphere_field(30, width) for width in (1.0, 0.015))

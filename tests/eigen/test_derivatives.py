@@ -223,6 +223,7 @@ class TestGradientsByAField:
     def inside(self, tensors):
         return self.of_field(hj.TensorField(self.grid, tensors))
 
+    @pytest.mark.slow
     def test_symmetric_and_equal_to_that_of_a_field_made_inside(self):
         field = hj.TensorField(self.grid, self.tensors)
         expected = jax.grad(self.inside)(jnp.asarray(self.tensors))
@@ -261,7 +262,7 @@ class TestGradientsByAField:
         dense = hj.assemble(field).stiffness.to_dense()
         np.testing.assert_allclose(dense, dense.T, atol=1e-14)
 
-    @pytest.mark.parametrize("kind", [hj.SurfaceMesh, hj.TetMesh])
+    @pytest.mark.parametrize("kind", [hj.SurfaceMesh, pytest.param(hj.TetMesh, marks=pytest.mark.slow)])
     def test_by_the_metric_of_a_mesh(self, kind):
         vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1.2]], float)
         cells = [[0, 1, 2, 3], [4, 2, 1, 3]] if kind is hj.TetMesh else [[0, 1, 2], [2, 1, 4], [0, 3, 1]]

@@ -145,6 +145,7 @@ def test_agrees_with_scikit_fem(rng, shape):
     np.testing.assert_allclose(pencil.measure, np.prod(grid.spacing) * np.prod(np.array(shape) - 1), rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_constant_diffusivity_has_one_operator():
     """Where |D| is constant, Fick's operator is that of the metric D⁻¹; only the unit of the raw signature differs."""
     grid, D = hj.Grid((9, 11), (0.1, 0.1)), np.array([[3.0, 1.0], [1.0, 2.0]])
@@ -188,7 +189,7 @@ def ring(shape):
 @pytest.mark.parametrize(
     ("shape", "boundary", "interpolation", "masked"),
     [
-        ((7, 8), "neumann", "linear", False),
+        pytest.param((7, 8), "neumann", "linear", False, marks=pytest.mark.slow),
         pytest.param((8, 8), "mean", "linear", True, marks=pytest.mark.slow),
         pytest.param((7, 8), ("periodic", "dirichlet"), "log-euclidean", False, marks=pytest.mark.slow),
         pytest.param((4, 5, 4), "neumann", "linear", False, marks=pytest.mark.slow),

@@ -297,6 +297,7 @@ def test_the_bias_between_dirichlet_sides_grows_with_t(mass):
 
 
 @pytest.mark.filterwarnings("ignore::hks_jax.AccuracyWarning")
+@pytest.mark.slow
 def test_truncation_map_of_a_thin_strip():
     # The lowest modes vary along one axis only; where those along the other axis begin, the spectrum has a gap.
     field = hj.TensorField(hj.Grid.from_bounds(0, 1, (16, 16)), np.broadcast_to(np.diag([1e4, 1.0]), (16, 16, 2, 2)))

@@ -277,6 +277,7 @@ def test_corrected_values_are_not_worse_and_intervals_contain_the_truth(field, l
 
 
 @pytest.mark.parametrize("freedom", [1.5, 6.0, 24.0, 150.0])
+@pytest.mark.slow
 def test_scores_have_the_probabilities_of_students_distribution(freedom):
     x = np.array([-30.0, -3.0, -0.2, 0.0, 1e-6, 2.45, 9.0])
     expected = -np.sign(x) * scipy.special.ndtri(scipy.special.stdtr(freedom, -np.abs(x)))
@@ -289,7 +290,8 @@ def test_scores_have_the_probabilities_of_students_distribution(freedom):
     assert normal_score(jnp.float32(7.0), np.inf) == 7
 
 
-@pytest.mark.parametrize("correlation", [0.0, 1.5, pytest.param(4.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("correlation", [0.0, 1.5, 4.0])
+@pytest.mark.slow
 def test_few_discoveries_are_false(rng, correlation):
     grid = hj.Grid((16, 16))
     apart = np.hypot(*np.moveaxis(grid.nodes - 8, -1, 0))
@@ -313,6 +315,7 @@ def test_few_discoveries_are_false(rng, correlation):
     assert found[:, bump > 0].mean() > 0.8
 
 
+@pytest.mark.slow
 def test_the_null_has_constant_tensors_inside_the_domain():
     D, signature = disc()
     bars = hj.uncertainty(signature, D, hj.TensorNoise.relative(D, 0.01), method="resample")
