@@ -161,7 +161,8 @@ def _hitting(xp: Any, stiffness: Any, mass: Any, inner: Any, times: Any) -> Any:
 
 def free_share(influence: Float[Array | np.ndarray, "m *shape"], space: FunctionSpace) -> Float[Array, " m"]:
     """Return the share of the domain's nodes at which the boundary's influence is below `FREE`, at each time."""
-    return jnp.sum((jnp.asarray(influence) < FREE).reshape(len(influence), -1), axis=1) / space.domain.sum()
+    free = (jnp.asarray(influence) < FREE).reshape(len(influence), -1)
+    return jnp.sum(free, axis=1, dtype=influence.dtype) / int(space.domain.sum())
 
 
 def half_free(pairs: Eigenpairs, first: Any, last: Any) -> Float[Array, ""]:

@@ -241,7 +241,9 @@ def test_method_auto_reports_which_times_came_from_where(npz, tmp_path):
     assert method["agreement"]["difference"] < 1e-4
     field = hj.TensorField(hj.Grid(SHAPE, (0.5, 0.25), (1.0, 2.0), disc()), metric())
     with np.load(out / "hks.npz") as read:
-        np.testing.assert_allclose(read["hks"][:1], hj.hks_spectrum_free(field, [0.1], boundary="mean"), rtol=1e-3)
+        np.testing.assert_allclose(
+            read["hks"][:1], 0.4 * np.pi * hj.hks_spectrum_free(field, [0.1], boundary="mean"), rtol=1e-3
+        )
 
 
 def test_nifti_slice_end_to_end_keeps_the_affine(nifti, tmp_path):
@@ -278,7 +280,7 @@ def test_a_volume_is_computed_whole(nifti, tmp_path, monkeypatch):
     tensors = read_tensors(nifti).tensors.astype(float)
     grid = hj.Grid((*SHAPE, 5), (2.0, 2.0, 3.0), mask=mask)
     field = hj.TensorField.from_diffusion(grid, tensors, "inverse")
-    expected = hj.hks(hj.eigenpairs(field, 12, "mean"), [20000.0, 50000.0])
+    expected = hj.hks(hj.eigenpairs(field, 12, "mean"), [20000.0, 50000.0], "flat")
     with np.load(out / "hks.npz") as read:
         np.testing.assert_allclose(read["hks"], expected, rtol=1e-5)  # the file's tensors are float32
         np.testing.assert_array_equal(read["mask"], mask)
@@ -291,7 +293,7 @@ def test_a_volume_is_computed_whole(nifti, tmp_path, monkeypatch):
     panels = drawn[0].axes
     assert len(panels) == 8
     assert [line.get_xdata()[0] for line in panels[0].lines][:1] == [place[0]]
-    assert drawn[0].get_suptitle() == "HKS in units of $t^{-3/2}$, metric D⁻¹"
+    assert drawn[0].get_suptitle().startswith("$(4\\pi t)^{3/2}$·HKS, which is 1 for flat space, metric D⁻¹\nD = ")
     assert "\n$\\sqrt{Dt}$ = " in panels[0].get_title()
 
 

@@ -206,7 +206,7 @@ def test_stress_on_the_command_line(tmp_path):
     grid = hj.Grid(GRID.shape, GRID.spacing, GRID.origin, MASK)
     pairs = hj.eigenpairs(hj.TensorField.from_indefinite(grid, STRESS, "shift", 1.5), 5, "mean")
     with np.load(out / "hks.npz") as read:
-        np.testing.assert_allclose(read["hks"], hj.hks(pairs, [1.0]), rtol=1e-9)
+        np.testing.assert_allclose(read["hks"], hj.hks(pairs, [1.0], "flat"), rtol=1e-9)
 
 
 def test_repairing_more_than_a_few_is_a_warning(tmp_path):
