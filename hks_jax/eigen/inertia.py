@@ -224,8 +224,8 @@ def locate(pencil: SymmetricPencil, wanted: int, probes: int) -> tuple[Scalar, S
     """Return an origin below all eigenvalues, a shift above the lowest 1 to 2·wanted eigenvalues, and their number.
 
     A bracket is halved, or divided in proportion to the counts, until it contains few enough eigenvalues. Each
-    factorisation is tested with `probes` random right-hand sides. If rounding does not separate many eigenvalues, the
-    number exceeds 2·wanted. If the search fails within `_TRIES` factorisations, the origin and the shift are NaN.
+    factorisation is tested with `probes` random right-hand sides. If rounding does not separate many eigenvalues, or
+    `_TRIES` factorisations do not, the number exceeds 2·wanted. Without a bracket, the origin and the shift are NaN.
     """
     size, count = scale(pencil), _counting(pencil, probes)
     infinite = jnp.full((), jnp.inf, size.dtype)
@@ -239,7 +239,8 @@ def locate(pencil: SymmetricPencil, wanted: int, probes: int) -> tuple[Scalar, S
     # Outside `jit`, the search for the origin calls the same compiled factorisation as spectrum slicing, which follows.
     start = _Search(-infinite, infinite, none, infinite, -least, none, none, jnp.ones((), bool))
     state = while_loop(lambda state: state.going & (state.tries < _TRIES), step, start)
-    low, first = (jnp.where(state.going, jnp.nan, end) for end in (state.low, state.first))
+    known = jnp.isfinite(state.low) & jnp.isfinite(state.high)
+    low, first = (jnp.where(known, end, jnp.nan) for end in (state.low, state.first))
     return low, first, state.number
 
 
