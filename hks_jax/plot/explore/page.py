@@ -263,7 +263,8 @@ def _turned(
         covariance=None,
         modes=None,
     )
-    arrays = {name: by.array(a) for name, a in result.arrays.items() if name in ("deviation", "influence")}
+    at_nodes = ("deviation", "z", "density", "influence")
+    arrays = {name: by.array(a) for name, a in result.arrays.items() if name in at_nodes}
     arrays |= {name: a for name, a in result.arrays.items() if name == "input_tensors"}
     result = replace(result, place=place, values=by.array(result.values), arrays=arrays)
     return result, {k: by.array(v) for k, v in (maps or {}).items()}, None if labels is None else by.array(labels), axes
