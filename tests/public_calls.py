@@ -100,7 +100,7 @@ CALLS: dict[str, Callable[[], Any]] = {
     "heat_trace": lambda: hj.heat_trace(pairs(), TIMES),
     "hks": lambda: [hj.hks(pairs(), TIMES, name) for name in ("raw", "flat", "volume", "heat-trace")],
     "hks_auto": lambda: hj.hks_auto(pairs(), [0.5, 8.0]),
-    "hks_expansion": lambda: hj.hks_expansion(field(), [0.5]),
+    "hks_expansion": lambda: hj.hks_expansion(field(), [0.5], order=1),
     "hks_spectrum_free": lambda: hj.hks_spectrum_free(field(), TIMES),
     "laplace_beltrami": lambda: hj.laplace_beltrami(field(), TENSORS[..., 0, 0]),
     "log_determinant": lambda: hj.log_determinant(closed(), hj.heat_coefficients(closed(), 0)),

@@ -94,7 +94,7 @@ def hks_expansion(
     coefficients = _coefficients(field, int(order), wraps)
     if not is_traced(t) and t.size:
         # Less than 0.1 % of the signature at the largest time does not count.
-        negligible = [1e-3 / float(jnp.max(t)) ** i for i in range(1, order + 1)]
+        negligible = [1e-3 / float(np.asarray(t).max()) ** i for i in range(1, order + 1)]
         names = [f"coefficient u{i} of the expansion" for i in range(1, order + 1)]
         differences = 10 if order > 1 and dimension == 2 else 6
         again = lambda f: _coefficients(f, int(order), wraps)[1:]  # noqa: E731

@@ -6,6 +6,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Float
 
 from hks_jax.arrays import nan_is_meant, nan_outside
@@ -164,7 +165,7 @@ def scalar_and_ricci_squared(metric: Jet) -> tuple[Float[Array, "..."], Float[Ar
 @nan_is_meant
 def laplace_beltrami(
     field: TensorField,
-    f: Float[Array, "*shape"] | Callable[[Array], Array],
+    f: Float[Array | np.ndarray, "*shape"] | Callable[[Array], Array],
     periodic: bool | Sequence[bool] = False,
 ) -> Float[Array, "*shape"]:
     """Return ∇²f = div grad f = (1/√|g|) ∂ₐ(√|g| gᵃᵇ ∂ᵦf) at the nodes; ∇²f is negative at a peak of f.

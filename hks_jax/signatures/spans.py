@@ -5,6 +5,7 @@ import math
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.arrays import nan_is_meant
 from hks_jax.checks import require_count, require_number
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.rim import half_free
@@ -15,6 +16,7 @@ SHORTEST = 2.0
 """The least ratio of the last to the first default time: nearer times give nearly equal signatures."""
 
 
+@nan_is_meant
 def default_times(pairs: Eigenpairs, n: int = 16, decay: float = 1e-4) -> Float[Array, " n"]:
     """Return n log-spaced times, from the eigenvalues (Sun, Ovsjanikov and Guibas 2009, section 5) and the boundary.
 
@@ -39,6 +41,7 @@ def default_times(pairs: Eigenpairs, n: int = 16, decay: float = 1e-4) -> Float[
     return _spaced(pairs, 4 * math.log(10.0) / last, -math.log(decay), n)
 
 
+@nan_is_meant
 def resolved_span(pairs: Eigenpairs, n: int) -> Float[Array, " n"]:
     """Return n log-spaced times as `default_times`, from the first time that the eigenpairs resolve.
 

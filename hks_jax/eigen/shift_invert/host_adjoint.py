@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from hks_jax.eigen.adjoints import adjoint as complement
 from hks_jax.eigen.adjoints.adjoint import Adjoint, Rows, Values, Vectors
-from hks_jax.eigen.shift_invert.matrices import factorise_on_host, host_matrices
+from hks_jax.eigen.shift_invert.matrices import factorise_stably_on_host, host_matrices
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
 from hks_jax.traced import is_traced
@@ -98,5 +98,5 @@ def _solve(
             rows, own = active[number == group], distance[number == group]
             (shift,) = complement.shifts_between(values, own.min(keepdims=True), own.max(keepdims=True))
             blocks = [rows[start : start + _BLOCK] for start in range(0, rows.size, _BLOCK)]
-            list(threads.map(solve, blocks, repeat(factorise_on_host(K - shift * M))))
+            list(threads.map(solve, blocks, repeat(factorise_stably_on_host(K - shift * M))))
     return x
