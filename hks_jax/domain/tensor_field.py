@@ -161,7 +161,7 @@ class TensorField(eqx.Module):
             0.25
             >>> diffusion = hj.TensorField.from_diffusion(field.grid, field.tensors, operator="fick")
             >>> pencil = hj.assemble(diffusion)
-            >>> print(pencil.measure.round(3), pencil.volume.round(3))  # the integrals of dx and of |D|^(−½) dx
+            >>> print(pencil.measure.round(2), pencil.volume.round(2))  # the integrals of dx and of |D|^(−½) dx
             1.0 0.5
         """
         tensors = _checked_tensors(name, grid, D)
@@ -257,7 +257,7 @@ class TensorField(eqx.Module):
 
         Examples:
             >>> print(field.with_tensors(2 * field.tensors).tensors[4, 4].diagonal())
-            [8. 2.]
+            [5. 5.]
         """
         return TensorField(grid or self.grid, tensors, self.interpolation, operator=self.operator)
 

@@ -192,12 +192,12 @@ class Eigenpairs(eqx.Module):
     @property
     def result(self) -> RESULTS:
         """The traceable code of the most serious failure, for a comparison with ``RESULTS.successful``."""
-        finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(self.pencil) if eqx.is_inexact_array(leaf)]
+        finite = _all_finite([leaf for leaf in jax.tree.leaves(self.pencil) if eqx.is_inexact_array(leaf)])
         code: Any = RESULTS  # mypy sees its members as strings
         result = code.where(jnp.any(self.uncertain), code.uncertain, code.successful)
         result = code.where(self.unconfirmed, code.unconfirmed, result)
         result = code.where(jnp.all(self.converged), result, code.unconverged)
-        return code.where(jnp.all(jnp.stack(finite)), result, code.not_finite)
+        return code.where(finite, result, code.not_finite)
 
     def messages(self) -> list[str]:
         """Return sentences that describe defects of these pairs. Values must be concrete."""
@@ -288,6 +288,11 @@ def _anisotropy(pencil: AnyPencil | None) -> float:
     values = np.linalg.eigvalsh(sample[np.isfinite(sample).all(axis=(1, 2))])
     values = values[values[:, 0] > 0]
     return float(np.quantile(values[:, -1] / values[:, 0], 1 - MANY)) if len(values) else 1.0
+
+
+@numpy_where_known()
+def _all_finite(xp: Any, arrays: list[Any]) -> Any:
+    return xp.all(xp.stack([xp.all(xp.isfinite(array)) for array in arrays]))
 
 
 class _Spectrum(NamedTuple):

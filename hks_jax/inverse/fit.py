@@ -28,6 +28,8 @@ _EXPLAINED = 1e-6
 On the same grid, fits of a metric that explains the target ended with residuals of 2e-9 to 7e-5 of the error, fits to
 targets of a finer grid or of a metric beyond the parametrisation with residuals of 1e-2 and more.
 Residuals below twice the tolerance of the search do not count, because the fit stops there."""
+_FALLING = 0.8
+"""A fit whose last step reduced the loss below this share had not ended when its steps were exhausted."""
 _UNEXPLAINED = (
     "The fitted metric does not explain the target, and its differences from init may be artefacts. Use another "
     'parametrisation, such as "log-euclidean", another init'
@@ -81,8 +83,9 @@ def fit_metric(
 
     Warns:
         AccuracyWarning: if the misfit is close to the truncation error of k pairs, so that the fitted metric may
-            compensate for truncation; if the misfit stays above the noise, so that the metric misses the target; or, if
-            no noise is given, if the residuals stay above a thousandth of the discretisation error.
+            compensate for truncation. If the fit ended, or its last step hardly improved it: if the misfit is above the
+            noise, so that the metric misses the target; or, without noise, if the residuals are above a thousandth of
+            the discretisation error.
 
     Raises:
         TypeError: if `init` is neither a grid nor a field, such as a mesh, on which no metric can be fitted.
@@ -134,16 +137,18 @@ def fit_metric(
         float(outcome.truncation),
         discretisation_misfit(problem, outcome),
     )
-    ended = result in ("converged", "stalled", "steps exhausted")
+    last = [step.loss for step in now.history[-2:]]
+    exhausted = result == "steps exhausted" and last[-1] > _FALLING * last[0]
+    ended = result in ("converged", "stalled") or exhausted
     if truncation_shows(misfit, left):
         warn_of_accuracy(
             f"k: the truncation to {problem.k} eigenpairs causes a misfit of about {left:.1e}, and the fit's misfit "
             f"is {misfit:.1e}. So the fitted metric may compensate for the truncation. Use k=None, or "
             f"k={more_pairs(problem, values)} or more, unless the target was computed with {problem.k} pairs"
         )
-    elif noise is not None and ended and result != "steps exhausted" and misfit > noise**2:
+    elif noise is not None and ended and misfit > noise**2:
         warn_of_accuracy(
-            f"noise: the fit {result} with residuals of {(2 * misfit) ** 0.5:.2g}, above the noise {noise:.2g}. "
+            f"noise: the fit ended ({result}) with residuals of {(2 * misfit) ** 0.5:.2g}, above the noise {noise:.2g}. "
             f"{_UNEXPLAINED}, weaker regularisers, or a larger noise"
         )
     elif noise is None and ended and misfit > max(_EXPLAINED * discretisation, 2 * search.tolerance**2):

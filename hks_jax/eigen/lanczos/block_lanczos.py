@@ -91,7 +91,8 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
         """Return the slice size and other static settings for k eigenvalues; the first ``nulls`` are zero."""
         slices = max(round(k / (self.slice_size or SLICE)), 1)
         size = math.ceil(1.06 * k / slices) + 2
-        return Plan(k, self.block, size, 3 * slices + 12, self.tolerance, nulls)
+        # The search divides residuals by an estimate of the mean gap, the result by the mean gap of the pairs found.
+        return Plan(k, self.block, size, 3 * slices + 12, self.tolerance / 4, nulls)
 
 
 def known_by_weyl(pencil: SymmetricPencil) -> bool:
