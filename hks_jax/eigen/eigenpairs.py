@@ -316,7 +316,7 @@ class _Spectrum(NamedTuple):
 def _gaps(xp: Any, spectrum: _Spectrum) -> Any:
     """Return, for each eigenvalue, the largest gap to the next one at which the two count as equal, (k)."""
     values, _, origin, tolerance, rounding = spectrum
-    finfo, length = jnp.finfo(values.dtype), xp.nanmax(values) - origin
+    finfo, length = jnp.finfo(values.dtype), xp.nanmax(values, initial=-xp.inf) - origin
     rounding = xp.where(length <= rounding, rounding, xp.minimum(rounding, length / 1000))
     stored = 4 * finfo.eps * xp.abs(values)
     return xp.maximum(xp.maximum(tolerance * (values - origin), stored), xp.maximum(rounding, finfo.tiny))
