@@ -604,7 +604,8 @@ def _full(grid):
 
 
 @pytest.mark.parametrize(
-    ("parametrisation", "finer"), [pytest.param("conformal", 1, marks=pytest.mark.slow), ("log-euclidean", 2)]
+    ("parametrisation", "finer"),
+    [pytest.param("conformal", 1, marks=pytest.mark.slow), pytest.param("log-euclidean", 2, marks=pytest.mark.slow)],
 )
 def test_a_target_that_the_metric_does_not_explain_is_told_without_noise(parametrisation, finer):
     grids = [hj.Grid.from_bounds(0, 1, (n, n)) for n in (8, 7 * finer + 1)]
