@@ -88,7 +88,8 @@ def pairs_of(name: str, arrays: Mapping[str, np.ndarray], pencil: AnyPencil) -> 
     solver_name = str(np.asarray(arrays["solver_name"]))
     values.setdefault("part", None)
     values.setdefault("rounding", jnp.zeros_like(values["eigenvalues"]))  # older files lack it
-    pairs = Eigenpairs(**values, lowest=lowest, frame=values["vectors"], pencil=pencil, solver_name=solver_name)
+    frame = values.pop("vectors")
+    pairs = Eigenpairs(**values, frame=frame, lowest=lowest, pencil=pencil, solver_name=solver_name)
     gap = np.concatenate([_residuals(pairs, number) for number in range(len(pencil.parts))])
     ends = np.array([pairs.next_eigenvalue, *pairs.eigenvalues[-1:], pairs.spectral_origin])
     size = np.max(np.abs(ends[np.isfinite(ends)]))
