@@ -94,17 +94,17 @@ def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: i
         return jnp.concatenate(of_all)[lowest] / math.sqrt(len(solved))
 
     return Eigenpairs(
-        values[lowest],
-        together(frames),
-        jnp.concatenate([pairs.residuals for pairs in solved])[lowest],
-        jnp.concatenate([pairs.converged for pairs in solved])[lowest],
-        jnp.concatenate([pairs.rounding for pairs in solved])[lowest],
+        eigenvalues=values[lowest],
+        residuals=jnp.concatenate([pairs.residuals for pairs in solved])[lowest],
+        converged=jnp.concatenate([pairs.converged for pairs in solved])[lowest],
+        rounding=jnp.concatenate([pairs.rounding for pairs in solved])[lowest],
         kept=jnp.ones(k, bool),
-        part=jax_array(np.repeat(np.arange(len(solved)), sizes))[lowest],
         next_eigenvalue=jax.lax.stop_gradient(values[order[k]]) if extra else jnp.asarray(jnp.inf, values.dtype),
         complete_below=_complete_below(pencil, solved, values[order[k + extra - 1 :][:1]], k + extra),
         spectral_origin=solved[0].spectral_origin,
         multiplet_tolerance=jnp.max(jnp.stack([pairs.multiplet_tolerance for pairs in solved])),
+        part=jax_array(np.repeat(np.arange(len(solved)), sizes))[lowest],
+        frame=together(frames),
         pencil=pencil,
         solver_name=" + ".join(dict.fromkeys(pairs.solver_name for pairs in solved)),
         lowest=solved[0].lowest,

@@ -53,9 +53,6 @@ class Eigenpairs(eqx.Module):
 
     Attributes:
         eigenvalues: (k,) in ascending order, in 1/(metric length)²; exactly 0 for null vectors.
-        frame: (k, n_dof) the values of `vectors`, but with a derivative that excludes rotations of eigenvectors among
-            themselves, which are singular at multiple eigenvalues. Derivatives of signatures include the effect of such
-            rotations by divided differences.
         residuals: (k,) ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁), where λ₁ is the first positive eigenvalue. In an interval, or if
             the null space is unknown, max(λ, λ₁) is replaced by the larger of two numbers: the mean gap of the
             eigenvalues, and the distance of λ from `spectral_origin`.
@@ -66,8 +63,6 @@ class Eigenpairs(eqx.Module):
             `jit` and on accelerators). Derivatives treat `rounding` as a constant.
         kept: (k,) whether each pair belongs to the truncated spectrum; signatures ignore the other pairs. The choices
             ``multiplet="drop"`` and ``"complete"`` may exclude the last pairs; `of_part` keeps only one part's pairs.
-        part: (k,) for the boundaries "mirror" and "mean", the index of the pencil's part that each pair belongs to (0
-            is the Neumann problem); otherwise None.
         next_eigenvalue: the first eigenvalue that is not kept; infinite if it does not exist or was not computed, as
             for an interval. Derivatives treat `next_eigenvalue` as a constant.
         complete_below: the bound below which the solver certifies that it missed no eigenvalue (for an interval,
@@ -77,22 +72,27 @@ class Eigenpairs(eqx.Module):
             for an interval its lower end.
         multiplet_tolerance: the gap, relative to the distance from `spectral_origin`, below which neighbouring
             eigenvalues count as equal. If the null space is unknown, gaps at the level of rounding count as zero too.
+        part: (k,) for the boundaries "mirror" and "mean", the index of the pencil's part that each pair belongs to (0
+            is the Neumann problem); otherwise None.
+        frame: (k, n_dof) the values of `vectors`, but with a derivative that excludes rotations of eigenvectors among
+            themselves, which are singular at multiple eigenvalues. Derivatives of signatures include the effect of such
+            rotations by divided differences.
         pencil: the matrices K and M.
         solver_name: the name of the solver.
         lowest: whether the pairs are the lowest; false for an interval.
     """
 
     eigenvalues: Float[Array, " k"]
-    frame: Float[Array, "k n_dof"]
     residuals: Float[Array, " k"]
     converged: Bool[Array, " k"]
     rounding: Float[Array, " k"]
     kept: Bool[Array, " k"]
-    part: Int[Array, " k"] | None
     next_eigenvalue: Float[Array, ""]
     complete_below: Float[Array, ""]
     spectral_origin: Float[Array, ""]
     multiplet_tolerance: Float[Array, ""]
+    part: Int[Array, " k"] | None
+    frame: Float[Array, "k n_dof"]
     pencil: AnyPencil
     solver_name: str = eqx.field(static=True)
     lowest: bool = eqx.field(static=True, default=True)

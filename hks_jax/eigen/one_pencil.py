@@ -206,17 +206,17 @@ def _pairs(
         constant = jax.lax.stop_gradient(values)
         values, following, bound = _translated(values, constant, zero, small, following, bound, origin)
     return Eigenpairs(
-        values,
-        frame,
-        residuals,
-        converged,
-        rounding,
+        eigenvalues=values,
+        residuals=residuals,
+        converged=converged,
+        rounding=rounding,
         kept=jax_array(np.ones(values.size, bool)),
-        part=None,
         next_eigenvalue=following,
         complete_below=bound,
         spectral_origin=origin if known or not lowest else jax.lax.stop_gradient(values[0]),
         multiplet_tolerance=tolerance,
+        part=None,
+        frame=frame,
         pencil=pencil,
         solver_name=solver.name,
         lowest=lowest,
