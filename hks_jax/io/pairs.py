@@ -13,7 +13,7 @@ from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.pencil import AnyPencil
 from hks_jax.storage import load_npz, write_npz
 
-ARRAYS = tuple(f.name for f in fields(Eigenpairs) if f.name not in ("frame", "pencil", "solver_name"))
+ARRAYS = "vectors", *(f.name for f in fields(Eigenpairs) if f.name not in ("frame", "pencil", "solver_name"))
 """The fields of `hks_jax.Eigenpairs` that are saved as arrays, without `frame`, which equals `vectors`."""
 _FAR = 1e-3
 """The residual, relative to the largest known eigenvalue, above which pairs count as pairs of another pencil."""
