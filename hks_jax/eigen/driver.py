@@ -103,12 +103,11 @@ def eigenpairs(
         pairs = _lowest(pencil, int(number), solver, multiplet, throw, report)
     pairs = pairs.on(pencil)
     known = jax.lax.stop_gradient(pairs)
-    result = known.result
     if is_traced(known.eigenvalues):
-        return result.error_if(pairs, result != RESULTS.successful) if throw else pairs
-    if throw and result != RESULTS.successful:
+        return known.result.error_if(pairs, known.result != RESULTS.successful) if throw else pairs
+    if throw and known.result != RESULTS.successful:
         codes: Any = RESULTS  # mypy sees its members as strings
-        raise RuntimeError(codes[result])
+        raise RuntimeError(codes[known.result])
     for message in known.messages():
         warn_of_accuracy(message)
     return pairs

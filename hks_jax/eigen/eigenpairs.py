@@ -200,7 +200,7 @@ class Eigenpairs(eqx.Module):
     @property
     def uncertain(self) -> Bool[Array, " k"]:
         """Whether `rounding` is more than 1 % of each eigenvalue; even the sign of the eigenvalue may be uncertain."""
-        return self.kept & (self.rounding > UNCERTAIN * jnp.abs(self.eigenvalues))
+        return _uncertain(self.kept, self.rounding, jax.lax.stop_gradient(self.eigenvalues))
 
     @property
     def result(self) -> RESULTS:
@@ -302,6 +302,11 @@ def _anisotropy(pencil: AnyPencil | None) -> float:
     values = np.linalg.eigvalsh(sample[np.isfinite(sample).all(axis=(1, 2))])
     values = values[values[:, 0] > 0]
     return float(np.quantile(values[:, -1] / values[:, 0], 1 - MANY)) if len(values) else 1.0
+
+
+@numpy_where_known()
+def _uncertain(xp: Any, kept: Any, rounding: Any, values: Any) -> Any:
+    return kept & (rounding > UNCERTAIN * xp.abs(values))
 
 
 @numpy_where_known()

@@ -198,7 +198,7 @@ def _pairs(
         no = jnp.zeros(0, bool)
         quality = jnp.zeros(0, values.dtype), no, no, jnp.asarray(1e-6, values.dtype)
     residuals, converged, zero, tolerance = quality
-    held = jax.lax.stop_gradient((solved_pencil, frame, values + origin, zero))
+    held = jax.lax.stop_gradient((solved_pencil, frame, values, origin, zero))
     small, rounding = _near_zero(*held, known, solver)
     # While differentiating, JAX may turn a constant array into a Python number.
     following, bound = jax_array(following), jax_array(bound)
@@ -232,19 +232,25 @@ def _translated(
 
 
 def _near_zero(
-    pencil: SymmetricPencil, vectors: Array, values: Array, zero: Array, known: bool, solver: Eigensolver
+    pencil: SymmetricPencil,
+    vectors: Array,
+    values: Array,
+    origin: Scalar,
+    zero: Array,
+    known: bool,
+    solver: Eigensolver,
 ) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
     """Return the eigenvalues that are zero within rounding, with 0 for the others, and `Eigenpairs.rounding`.
 
     In float32, eigenvalues that are zero within rounding may be accurate in float64, in which the host computes.
     """
-    nothing = jnp.zeros_like(values)
+    nothing = jax_array(np.zeros(values.shape, values.dtype))
     if values.dtype != np.float32 or not values.size:
         return nothing, nothing
     if not _single_on_host(values, (pencil, vectors, values)):
         return nothing, nothing if known else jnp.where(zero, indistinct(pencil, values.dtype), 0)
     small, rounding = np.zeros((2, values.size), np.float32)
-    near = np.abs(np.asarray(values)) <= float(indistinct(pencil, values.dtype)) / UNCERTAIN
+    near = np.abs(np.asarray(values) + np.asarray(origin)) <= float(indistinct(pencil, values.dtype)) / UNCERTAIN
     where = np.flatnonzero(near & (np.arange(values.size) >= (pencil.n_null if known else 0)))
     if where.size:
         quotients, changes = near_zero(pencil, np.asarray(vectors)[where], solver.in_double)
