@@ -68,6 +68,7 @@ def potential(x: Any) -> Any:
 
 
 CALLS: dict[str, Callable[[], Any]] = {
+    "align": lambda: hj.align(pairs(), pairs(), (SOURCE, SOURCE)),
     "assemble": lambda: hj.assemble(field(), "mean"),
     "assemble with fields": lambda: hj.assemble(field(), potential=potential, density=np.ones(SHAPE)),
     "assemble cancelling": lambda: hj.assemble(field(), quadrature="cancelling"),
@@ -77,6 +78,8 @@ CALLS: dict[str, Callable[[], Any]] = {
     "colouring": lambda: hj.colouring(field(), [0.5]),
     "count_eigenvalues": lambda: hj.count_eigenvalues(field(), 0.5),
     "crop": lambda: hj.crop(hj.reflect(field(), 2).tensors[..., 0, 0], GRID),
+    "decompose": lambda: hj.decompose(pairs(), [TENSORS[..., 0, 0], TENSORS[..., 1, 1]]),
+    "decompose unmeasured": lambda: hj.decompose(pairs(), np.where(INDICES[0] == 2, np.nan, TENSORS[..., 0, 0])),
     "default_boundary": lambda: hj.default_boundary(MASK),
     "default_energies": lambda: hj.default_energies(pairs(), 40),
     "default_times": lambda: hj.default_times(pairs(), 3),
@@ -86,6 +89,7 @@ CALLS: dict[str, Callable[[], Any]] = {
     "eigenpairs in an interval": lambda: hj.eigenpairs(field(), interval=(0.1, 0.7)),
     "eigh": lambda: hj.eigh(MATRIX),
     "eigsh": lambda: hj.eigsh(MATRIX, k=2),
+    "energy": lambda: hj.energy(pairs(), TENSORS[..., 0, 0]),
     "factorise": lambda: hj.factorise(field(), 1.0).solve(jnp.ones(int(pairs().space.domain.sum()))),
     "gaussian_curvature": lambda: hj.gaussian_curvature(field()),
     "gaussian_scale_space": lambda: hj.gaussian_scale_space(field(), TIMES, TENSORS[..., 0, 0]),
@@ -106,6 +110,7 @@ CALLS: dict[str, Callable[[], Any]] = {
     "log_determinant": lambda: hj.log_determinant(closed(), hj.heat_coefficients(closed(), 0)),
     "matrix_function": lambda: hj.matrix_function(MATRIX, jnp.exp),
     "push": lambda: jax.jvp(loss, (jnp.asarray(TENSORS),), (jnp.asarray(TENSORS),)),
+    "reconstruct": lambda: hj.reconstruct(pairs(), np.ones(12)),
     "reflect": lambda: hj.reflect(field(), 2),
     "region_statistics": lambda: hj.region_statistics(hj.hks(pairs(), TIMES), MASK.astype(int)),
     "scalar_curvature": lambda: hj.scalar_curvature(field()),
@@ -113,7 +118,9 @@ CALLS: dict[str, Callable[[], Any]] = {
     "shape_dna": lambda: hj.shape_dna(pairs()),
     "smooth_tensors": lambda: hj.smooth_tensors(GRID, TENSORS, 1.0),
     "sparse_pencil": lambda: hj.sparse_pencil(MATRIX),
+    "spectral_filter": lambda: hj.spectral_filter(pairs(), TENSORS[..., 0, 0], lambda x: 1 / (1 + x)),
     "spectral_signature": lambda: hj.spectral_signature(pairs(), lambda p, x: p / (1 + x), jnp.ones(1)),
+    "surrogates": lambda: hj.surrogates(pairs(), TENSORS[..., 0, 0], jax.random.key(0), 2),
     "tensor_invariants": lambda: hj.tensor_invariants(field()),
     "truncation": lambda: hj.truncation(pairs(), TIMES),
     "truncation_map": lambda: hj.truncation_map(pairs(), TIMES),
