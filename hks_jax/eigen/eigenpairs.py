@@ -342,8 +342,8 @@ def _cut_multiplet(xp: Any, spectrum: _Spectrum, kept: Any) -> Any:
 
 @numpy_where_known()
 def _multiplets(xp: Any, spectrum: _Spectrum) -> Any:
-    ends = _ends_of_multiplets(xp, spectrum)
-    return xp.cumsum(ends) - ends
+    ends = _ends_of_multiplets(xp, spectrum).astype(xp.int32)
+    return xp.cumsum(ends, dtype=xp.int32) - ends
 
 
 def _ends_of_multiplets(xp: Any, spectrum: _Spectrum) -> Any:

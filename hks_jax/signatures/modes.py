@@ -6,6 +6,7 @@ nodal values. All functions of this module use the mass M.
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -15,11 +16,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.arrays import ByKey, nan_is_meant, nan_outside
+from hks_jax.arrays import ByKey, nan_is_meant
 from hks_jax.checks import real_array, require_number, require_real
+from hks_jax.compilation import numpy_where_known
 from hks_jax.domain import spd
 from hks_jax.eigen.eigenpairs import Eigenpairs, require_pairs
-from hks_jax.fem.space import GridSpace
+from hks_jax.fem.space import GridSpace, mask_for
+from hks_jax.linear.operators import Operator
 from hks_jax.linear.products import inner_products, matmul
 from hks_jax.signatures.filters import Custom
 from hks_jax.signatures.spectral_functions import spectral_flow
@@ -115,10 +118,14 @@ def reconstruct(pairs: Eigenpairs, c: Any) -> Float[Array, "*functions_and_shape
     m = coefficients.shape[-1] if coefficients.ndim else 0
     if not 1 <= m <= pairs.k:
         raise ValueError(f"c: got shape {coefficients.shape}; expected (…, m) with 1 to {pairs.k} coefficients")
-    modes = jnp.where(pairs.kept[:m, None], pairs.at_nodes[:m], 0)
-    nodal = matmul(coefficients.reshape(-1, m), modes)
-    extended = pairs.space.extend(nodal)
-    return extended.reshape(*coefficients.shape[:-1], *pairs.space.node_shape)
+    nodal = _sum(coefficients.reshape(-1, m), pairs.kept, pairs.at_nodes)
+    return pairs.space.extend(nodal).reshape(*coefficients.shape[:-1], *pairs.space.node_shape)
+
+
+@numpy_where_known()
+def _sum(xp: Any, coefficients: Any, kept: Any, modes: Any) -> Any:
+    m = coefficients.shape[1]
+    return matmul(xp.where(kept[None, :m], coefficients, 0), modes[:m])
 
 
 @nan_is_meant
@@ -148,60 +155,73 @@ def energy(pairs: Eigenpairs, f: Any, diffusivity: Any = None) -> ModeEnergies:
         True
     """
     fit = fitted(pairs, f)
-    n_parts, part = len(pairs.pencil.parts), pairs.pencil.parts[0]
-    c, k, leading, dtype = fit.coefficients, pairs.k, fit.leading, fit.coefficients.dtype
-
-    def integral(u: Float[Array, "s n"], v: Float[Array, "s n"]) -> Float[Array, " s"]:
-        return jnp.sum(u * part.integrals(v), axis=1)
-
-    known = jnp.ones(fit.rows.shape[1:], dtype) if fit.measured is None else fit.measured.astype(dtype)
-    total, one = integral(fit.rows, fit.rows), known[None]
-    mean = jnp.sum(part.integrals(fit.rows) * one, axis=1) / integral(one, one)
-    deviation = fit.rows - mean[:, None] * one
-    variance = integral(deviation, deviation)
-    left = (fit.rows - matmul(c, fit.modes)) * one
-    # The residual f − Σcⱼφⱼ of the fit is orthogonal to all modes. So the residual of the first i modes is the sum of
-    # the squared norms of the fit's residual and of Σ_{j>i} cⱼφⱼ, which is a sum over j > i of the terms below.
-    gram = jnp.eye(k, dtype=dtype) if fit.gram is None else fit.gram
-    terms = c * (2 * matmul(c, jnp.tril(gram, -1)) + jnp.diagonal(gram) * c)
-    beyond = jnp.cumsum(terms[:, ::-1], axis=1)[:, ::-1] - terms
-    residual = jnp.maximum(integral(left, left)[:, None] + beyond / n_parts, 0)
-    varies = variance > jnp.finfo(dtype).eps * total
-    share = nan_outside(1 - residual / jnp.where(varies, variance, 1)[:, None], varies[:, None])
-    lengths = _lengths(pairs, diffusivity)
+    copies, k, dtype = len(pairs.pencil.parts), pairs.k, fit.coefficients.dtype
+    known = np.ones(fit.rows.shape[1:], dtype) if fit.measured is None else fit.measured.astype(dtype)
+    gram = np.eye(k, dtype=dtype) if fit.gram is None else fit.gram
+    found = _energies(_measure(pairs), fit.rows, known, fit.coefficients, fit.modes, gram, copies)
+    energies, residual, share, total = found
+    if diffusivity is None:
+        diffusivity = _mean_diffusivity(pairs)
+    else:
+        require_number("diffusivity", diffusivity)
+        diffusivity = jnp.asarray(diffusivity, dtype)
     return ModeEnergies(
         pairs.eigenvalues,
-        2 * math.pi * lengths,
-        4 * math.log(2.0) * lengths,
-        (c * c / n_parts).reshape(*leading, k),
-        residual.reshape(*leading, k),
-        share.reshape(*leading, k),
-        total.reshape(leading),
+        *_lengths(pairs.eigenvalues, diffusivity),
+        energies.reshape(*fit.leading, k),
+        residual.reshape(*fit.leading, k),
+        share.reshape(*fit.leading, k),
+        total.reshape(fit.leading),
     )
+
+
+# The residual f − Σcⱼφⱼ of the fit is orthogonal to all modes. So the residual of the first i modes is the sum of the
+# squared norms of the fit's residual and of Σ_{j>i} cⱼφⱼ, which is a sum over j > i of the ``terms``.
+@numpy_where_known(static_argnums=6)
+def _energies(
+    xp: Any, measure: Any, rows: Any, known: Any, c: Any, modes: Any, gram: Any, copies: int
+) -> tuple[Any, Any, Any, Any]:
+    """Return the energies, the residuals and the shares of variance (s, k), and ∫f² (s)."""
+
+    def integral(u: Any) -> Any:
+        return xp.sum(u * _weighted(xp, measure, u), axis=1)
+
+    total, one = integral(rows), known[None]
+    mean = xp.sum(_weighted(xp, measure, rows) * one, axis=1) / integral(one)
+    variance = integral(rows - mean[:, None] * one)
+    terms = c * (2 * matmul(c, xp.tril(gram, -1)) + xp.diagonal(gram)[None] * c)
+    beyond = xp.cumsum(terms[:, ::-1], axis=1)[:, ::-1] - terms
+    left = integral((rows - matmul(c, modes)) * one)
+    residual = xp.maximum(left[:, None] + beyond / copies, 0)
+    varies = variance > xp.finfo(c.dtype).eps * total
+    share = xp.where(varies[:, None], 1 - residual / xp.where(varies, variance, 1)[:, None], xp.nan)
+    return c * c / copies, residual, share, total
 
 
 # A Gaussian of standard deviation σ multiplies a wave cos(ξ·x) by exp(−σ²|ξ|²/2), which is ½ for σ = √(2 ln2)/|ξ|. Its
 # full width at half maximum is 2√(2 ln2) σ = 4 ln2/|ξ|.
-def _lengths(pairs: Eigenpairs, diffusivity: Any) -> Float[Array, " k"]:
-    """Return 1/|ξ| = √(D/λ) for each mode; infinite where λ ≤ 0."""
-    values, dtype = pairs.eigenvalues, pairs.eigenvalues.dtype
-    if diffusivity is None:
-        scale = jax.lax.stop_gradient(_mean_diffusivity(pairs)).astype(dtype)
-    else:
-        require_number("diffusivity", diffusivity)
-        scale = jnp.asarray(diffusivity, dtype)
+@numpy_where_known()
+def _lengths(xp: Any, values: Any, diffusivity: Any) -> tuple[Any, Any]:
+    """Return the wavelength 2π/|ξ| and the width 4 ln2/|ξ| for |ξ|² = λ/D; infinite where λ ≤ 0."""
     positive = values > 0
-    return jnp.where(positive, jnp.sqrt(scale / jnp.where(positive, values, 1)), jnp.inf)
+    lengths = xp.where(positive, xp.sqrt(diffusivity / xp.where(positive, values, 1)), xp.inf)
+    return 2 * math.pi * lengths, 4 * math.log(2.0) * lengths
 
 
 def _mean_diffusivity(pairs: Eigenpairs) -> Float[Array, ""]:
+    """Return the mean of trace(T⁻¹)/d over the nodes of a grid with the metric T, or 1."""
     metric, space = pairs.pencil.parts[0].metric, pairs.space
     if metric is None or not isinstance(space, GridSpace):
         return jnp.ones((), pairs.eigenvalues.dtype)
-    d, domain = space.dimension, space.domain
-    tensors = jnp.where(domain[..., None, None], metric.tensors, jnp.eye(d, dtype=metric.tensors.dtype))
-    mean = jnp.trace(spd.inverse(tensors), axis1=-2, axis2=-1) / d
-    return jnp.sum(jnp.where(domain, mean, 0)) / float(domain.sum())
+    return _mean_of(jax.lax.stop_gradient(metric.tensors), mask_for(metric.tensors, space.domain))
+
+
+@numpy_where_known()
+def _mean_of(xp: Any, tensors: Any, domain: Any) -> Any:
+    d = tensors.shape[-1]
+    inverse = spd.inverse(xp.where(domain[..., None, None], tensors, xp.eye(d, dtype=tensors.dtype)))
+    mean = sum(inverse[..., a, a] for a in range(d)) / d
+    return xp.sum(xp.where(domain, mean, 0)) / xp.sum(domain, dtype=tensors.dtype)
 
 
 class _OfEigenvalue(ByKey):
@@ -292,7 +312,7 @@ def _given(
     rows = space.restrict(u.reshape(-1, *shape))
     if is_traced(rows):
         measured = jnp.all(~jnp.isnan(rows[:1]), axis=0)
-        return jnp.where(measured, rows, 0), leading, measured
+        return jnp.where(measured[None], rows, 0), leading, measured
     known = np.asarray(rows)
     if infinite := int(np.isinf(known).sum()):
         raise ValueError(f"f: got {infinite} infinite values inside the mask; expected finite values, or NaN")
@@ -312,34 +332,66 @@ def _given(
 def fitted(pairs: Eigenpairs, f: Any) -> Fit:
     """Return the fit of `decompose`, after its checks of the maps f."""
     rows, leading, measured = _given(pairs, f)
-    parts, even = pairs.pencil.parts, pairs.of_part(0).kept
-    modes = jnp.where(even[:, None], pairs.at_nodes, 0)
-    # Each doubling of the domain doubles inner products of even functions. Even functions are orthogonal to odd ones.
-    weights = len(parts) * parts[0].integrals(rows)
-    if measured is None and parts[0].row_sums is None:
-        return Fit(rows, leading, None, modes, inner_products(modes, weights), None)
-
-    def over_measured(modes: Float[Array, "k n"]) -> Float[Array, "k k"]:
-        own = modes if measured is None else jnp.where(measured, modes, 0)
-        return inner_products(own, len(parts) * parts[0].integrals(own)) + jnp.diag(1 - even.astype(modes.dtype))
-
-    if measured is None or parts[0].row_sums is not None or not is_traced(measured):
-        gram = over_measured(modes)
-    else:
+    copies, even = len(pairs.pencil.parts), pairs.of_part(0).kept
+    measure = _measure(pairs)
+    modes = _chosen(pairs.at_nodes, even)
+    if measured is None and measure[1] is None:
+        return Fit(rows, leading, None, modes, _products(measure, modes, rows, None, copies), None)
+    gram = partial(_gram, measure, even=even, copies=copies)
+    if measured is not None and is_traced(measured) and measure[1] is None:
         identity = jnp.eye(pairs.k, dtype=modes.dtype)
-        gram = jax.lax.cond(jnp.all(measured), lambda _: identity, over_measured, modes)
-    if measured is not None:
-        weights = jnp.where(measured, weights, 0)
-    least = jnp.min(jnp.linalg.eigvalsh(jax.lax.stop_gradient(gram)))
+        inner = jax.lax.cond(jnp.all(jnp.asarray(measured)), lambda *_: identity, gram, modes, measured)
+    else:
+        inner = gram(modes, measured)
+    coefficients, least = _solved(inner, _products(measure, modes, rows, measured, copies))
     _tell_if_unsure(pairs.k, least, measured)
-    determined = least > _negligible(gram.dtype)
-    solvable = jnp.where(determined, gram, jnp.eye(pairs.k, dtype=gram.dtype))
-    coefficients = jnp.linalg.solve(solvable, inner_products(modes, weights).T).T
     mask = None if measured is None else jnp.asarray(measured)
-    return Fit(rows, leading, mask, modes, nan_outside(coefficients, determined), gram)
+    return Fit(rows, leading, mask, modes, coefficients, inner)
 
 
-def _negligible(dtype: np.dtype) -> float:
+def _measure(pairs: Eigenpairs) -> tuple[Operator, Float[Array, " n"] | None]:
+    """Return the mass of the domain, and for cancelling elements its row sums, which integrate nodal values."""
+    part = pairs.pencil.parts[0]
+    return part.mass, part.row_sums
+
+
+def _weighted(xp: Any, measure: Any, rows: Any) -> Any:
+    """Return weights w (s, n) for nodal values of functions u: w·φ = ∫φu, as `Pencil.integrals` does."""
+    mass, row_sums = measure
+    return (mass @ rows.T).T if row_sums is None else xp.where(xp.isinf(row_sums), 0, row_sums)[None] * rows
+
+
+@numpy_where_known()
+def _chosen(xp: Any, modes: Any, even: Any) -> Any:
+    return xp.where(even[:, None], modes, 0)
+
+
+# Each doubling of the domain doubles inner products of even functions. Even functions are orthogonal to odd ones.
+@numpy_where_known(static_argnums=4)
+def _products(xp: Any, measure: Any, modes: Any, rows: Any, measured: Any, copies: int) -> Any:
+    """Return the inner products (s, k) of rows, which are 0 at unmeasured nodes, with the modes at measured nodes."""
+    weights = copies * _weighted(xp, measure, rows)
+    if measured is not None:
+        weights = xp.where(measured[None], weights, 0)
+    return inner_products(modes, weights) if xp is jnp else weights @ modes.T
+
+
+def _gram(measure: Any, modes: Any, measured: Any, even: Any, copies: int) -> Float[Array, "k k"]:
+    """Return the inner products of the modes over the measured nodes, and 1 on the diagonal for unused modes."""
+    own = modes if measured is None else jnp.where(measured[None], modes, 0)
+    return _products(measure, own, own, measured, copies) + jnp.diag(1 - even.astype(modes.dtype))
+
+
+@numpy_where_known()
+def _solved(xp: Any, gram: Any, products: Any) -> tuple[Any, Any]:
+    """Return the coefficients, NaN if they are not determined, and the least eigenvalue of the Gram matrix."""
+    least = xp.min(xp.linalg.eigvalsh(gram if xp is np else jax.lax.stop_gradient(gram)))
+    determined = least > _negligible(gram.dtype)
+    solvable = xp.where(determined, gram, xp.eye(len(gram), dtype=gram.dtype))
+    return xp.where(determined, xp.linalg.solve(solvable, products.T).T, xp.nan), least
+
+
+def _negligible(dtype: Any) -> float:
     return float(jnp.finfo(dtype).eps) ** 0.5
 
 

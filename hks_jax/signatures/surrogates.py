@@ -75,8 +75,9 @@ def _random_rotations(
 ) -> Float[Array, "n k k"]:
     """Return random orthogonal matrices that mix only modes of one group; modes that do not turn stay."""
     k = len(labels)
-    within = (labels[:, None] == labels) & turns[:, None] & turns
-    entries = jnp.where(within, jax.random.normal(key, (n, k, k), dtype), jnp.where(turns, 0, jnp.eye(k, dtype=dtype)))
+    within = (labels[:, None] == labels[None]) & turns[:, None] & turns[None]
+    stays = jnp.diag((~turns).astype(dtype))
+    entries = jnp.where(within[None], jax.random.normal(key, (n, k, k), dtype), stays[None])
     q, r = jnp.linalg.qr(entries)
     return q * jnp.where(jnp.diagonal(r, axis1=1, axis2=2) < 0, -1, 1)[:, None, :].astype(dtype)
 

@@ -47,7 +47,14 @@ PENCILS = {
     "tetrahedra": lambda: hj.assemble(hj.examples.ball_mesh(2)),
     "matrix": lambda: hj.sparse_pencil(np.diag([1.0, 2.0, 5.0, 7.0, 7.0, 8.0, 9.0, 11.0, 14.0, 20.0]) + 0.1),
 }
+QUICK = {"neumann", "mean", "cancelling mean", "surface", "tetrahedra"}
 MADE = {}
+
+
+def on(*names):
+    """Parametrise over domains; those not among the quick ones are slow for the compiler."""
+    marked = [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in names]
+    return pytest.mark.parametrize("name", marked)
 
 
 def pairs_of(name, k=9):
@@ -75,7 +82,7 @@ def even(pairs):
     return np.asarray(pairs.of_part(0).kept)
 
 
-@pytest.mark.parametrize("name", PENCILS)
+@on(*PENCILS)
 def test_modes_are_orthonormal_in_the_mass_and_a_reconstruction_is_the_projection(name, rng):
     pairs = pairs_of(name)
     used, n_parts = even(pairs), len(pairs.pencil.parts)
@@ -97,7 +104,7 @@ def test_modes_are_orthonormal_in_the_mass_and_a_reconstruction_is_the_projectio
         np.testing.assert_allclose(c[:, used], n_parts * inner(pairs, np.nan_to_num(f)[:, None], np.nan_to_num(modes)))
 
 
-@pytest.mark.parametrize("name", PENCILS)
+@on(*PENCILS)
 def test_energies_and_residuals_add_up(name, rng):
     pairs = pairs_of(name)
     f = np.nan_to_num(maps(pairs, rng))
@@ -115,7 +122,7 @@ def test_energies_and_residuals_add_up(name, rng):
     np.testing.assert_allclose(found.explained, 1 - np.asarray(found.residual) / variance[:, None], atol=1e-10)
 
 
-@pytest.mark.parametrize("name", ["neumann", "mean", "cancelling", "cancelling mean", "fick", "volume", "surface mean"])
+@on("neumann", "mean", "cancelling", "cancelling mean", "fick", "volume", "surface mean")
 def test_filters_are_heat_flow_and_spectral_signatures(name, rng):
     pairs = pairs_of(name)
     f = maps(pairs, rng)
@@ -149,7 +156,7 @@ def decay_over(p, x):
 # --- unmeasured nodes ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["neumann", "dirichlet", "mean", "cancelling", "volume", "surface", "tetrahedra"])
+@on("neumann", "dirichlet", "mean", "cancelling", "volume", "surface", "tetrahedra")
 def test_a_sum_of_modes_is_recovered_from_the_measured_nodes(name, rng):
     pairs = pairs_of(name)
     c = np.where(even(pairs), rng.standard_normal(pairs.k), 0)
@@ -213,7 +220,7 @@ def test_maps_that_cannot_be_decomposed(rng):
 # --- wavelengths --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("diffusivity", [1.0, 0.7e-3])
+@pytest.mark.parametrize("diffusivity", [0.7e-3, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_the_energy_of_a_plane_wave_is_at_its_wavelength_in_mm(diffusivity):
     """Two waves over 24 voxels of 2 mm have a length of 24 mm; with Fick's operator, t is in s."""
     grid = hj.Grid((24, 9), 2.0)
@@ -251,7 +258,7 @@ def coefficients(tensors, f):
     return hj.decompose(pairs, f), hj.energy(pairs, f).energy
 
 
-@pytest.mark.parametrize("unmeasured", [False, True])
+@pytest.mark.parametrize("unmeasured", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_derivatives_of_coefficients(unmeasured, rng):
     f = rng.standard_normal(SHAPE)
     if unmeasured:
@@ -271,6 +278,7 @@ def test_derivatives_of_coefficients(unmeasured, rng):
     assert float(jnp.sum(loss(start)[1] * direction)) == pytest.approx(difference, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_filter_has_derivatives_at_multiple_eigenvalues():
     square = flat((6, 6), (1.0, 1.0))
     f, rng = np.cos(np.arange(36.0)).reshape(6, 6), np.random.default_rng(3)
@@ -286,6 +294,24 @@ def test_a_filter_has_derivatives_at_multiple_eigenvalues():
     assert float(slope) == pytest.approx(float(loss(1e-4) - loss(-1e-4)) / 2e-4, rel=1e-5)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["mean", "cancelling"])
+def test_compiled_and_where_rank_promotion_is_an_error(name, rng):
+    pairs, f = pairs_of(name), maps(pairs_of(name), rng)
+    calls = (
+        hj.decompose,
+        lambda p, f: hj.reconstruct(p, jnp.ones((2, 5))),
+        lambda p, f: hj.energy(p, f).explained,
+        lambda p, f: hj.spectral_filter(p, f, decay),
+        lambda p, f: hj.surrogates(p, f, jax.random.key(0), 3),
+    )
+    with jax.numpy_rank_promotion("raise"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", hj.AccuracyWarning)
+        for call in calls:
+            np.testing.assert_allclose(jax.jit(call)(pairs, f), call(pairs, f), atol=1e-11)
+
+
+@pytest.mark.slow
 def test_under_vmap_and_in_single_precision(rng):
     pairs, f = pairs_of("mean"), maps(pairs_of("mean"), rng, 3)
     np.testing.assert_allclose(jax.vmap(lambda u: hj.decompose(pairs, u))(f), hj.decompose(pairs, f), atol=1e-13)
@@ -322,9 +348,7 @@ def test_surrogates_keep_the_energy_of_each_multiplet_and_correlate_as_theory_sa
         own = labels == label
         # Also the inner products of the maps stay.
         gram = np.einsum("nai,nbi->nab", d[:, :, own], d[:, :, own])
-        np.testing.assert_allclose(
-            gram, np.broadcast_to(c[:, own] @ c[:, own].T, gram.shape), atol=1e-12
-        )
+        np.testing.assert_allclose(gram, np.broadcast_to(c[:, own] @ c[:, own].T, gram.shape), atol=1e-12)
     np.testing.assert_allclose(d[:, :, 0], np.broadcast_to(c[:, 0], (4000, 2)), atol=1e-12)  # the means
     size, share = np.bincount(labels[1:])[1:], np.zeros(labels.max())
     kept = c[0, 1:] ** 2
@@ -369,7 +393,7 @@ def rotated(pairs, rng):
 
 
 @pytest.mark.parametrize("way", ["landmarks", "maps"])
-@pytest.mark.parametrize("domain", ["square", "sphere", "torus"])
+@pytest.mark.parametrize("domain", ["square", pytest.param("sphere", marks=pytest.mark.slow), "torus"])
 def test_alignment_undoes_a_rotation_and_changes_no_spectral_function(way, domain, rng):
     if domain == "square":
         pairs = square_pairs()
