@@ -320,9 +320,10 @@ def _given(
     if not missing.any():
         return rows, leading, None
     if (missing != missing[0]).any():
+        some = int((missing.any(axis=0) & ~missing.all(axis=0)).sum())
         raise ValueError(
-            f"f: got {missing.any(axis=0).sum()} nodes with NaN in only some of {len(known)} maps, or in different "
-            "ones; expected NaN in all maps or in none. Pass maps with the same unmeasured nodes together"
+            f"f: got {some} nodes with NaN in only some of {len(known)} maps; expected NaN in all maps or in none. "
+            "Decompose maps with the same unmeasured nodes together"
         )
     if missing.all():
         raise ValueError("f: got NaN at all nodes inside the mask; expected measured values")
