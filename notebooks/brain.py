@@ -173,7 +173,7 @@ command = (
     f"hks {scan} --bval {bval} --bvec {bvec} -o {folder / 'out'} --slice z={index} --erode 1 --repair nearest:1e-4"
 )
 command += f" --b-max 1500 --metric inverse --components largest -k 250 --times {' '.join(map(str, times))}"
-command += " --boundary neumann --quiet"
+command += " --boundary neumann --normalisation raw --quiet"
 print("hks-jax", command)
 assert main(command.split()) == 0
 with np.load(folder / "out" / "hks.npz") as result:

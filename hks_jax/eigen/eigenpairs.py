@@ -13,11 +13,13 @@ from hks_jax.compilation import numpy_where_known
 from hks_jax.domain.tensor_checks import MANY
 from hks_jax.eigen.quality import indistinct
 from hks_jax.fem.pencil import AnyPencil
-from hks_jax.fem.space import FunctionSpace
+from hks_jax.fem.space import FunctionSpace, MatrixSpace
 from hks_jax.traced import is_traced
 
 _ROUNDED = 1e-3
 """If rounding tensors to float32 changes eigenvalues by more than this relative error, a message reports it."""
+UNCERTAIN = 1e-2
+"""If rounding matrices to float32 changes eigenvalues by more than this relative error, a message reports it."""
 _SAMPLE = 20_000
 """The number of tensors in the sample that measures anisotropy."""
 
@@ -36,8 +38,8 @@ class RESULTS(eqx.Enumeration):
         "slightly different k."
     )
     uncertain = (
-        "Some eigenvalues cannot be distinguished from zero in float32 (see `.rounding`). Use float64, or state the "
-        "null vectors."
+        "Rounding of the matrices to float32 may change some eigenvalues by more than 1 % (see `.rounding`). Use "
+        "float64, or state the null vectors."
     )
 
 
@@ -59,9 +61,10 @@ class Eigenpairs(eqx.Module):
             the null space is unknown, max(λ, λ₁) is replaced by the larger of two numbers: the mean gap of the
             eigenvalues, and the distance of λ from `spectral_origin`.
         converged: (k,) whether the residual is at most the solver's tolerance, or at most the level of rounding.
-        rounding: (k,) for eigenvalues of float32 matrices that are zero within the rounding of the largest eigenvalue,
-            the error that rounding of the matrices' entries may cause; 0 for other eigenvalues, and for eigenvalues
-            that are zero in float64 too. Derivatives treat `rounding` as a constant.
+        rounding: (k,) for small eigenvalues of float32 matrices, the error that rounding of the matrices' entries may
+            cause; 0 for other eigenvalues, and for eigenvalues that are zero in float64 too. An eigenvalue is small if
+            the rounding of the largest one may change it by more than 1 % (outside of `jit` on CPUs), or 100 % (under
+            `jit` and on accelerators). Derivatives treat `rounding` as a constant.
         kept: (k,) whether each pair belongs to the truncated spectrum; signatures ignore the other pairs. The choices
             ``multiplet="drop"`` and ``"complete"`` may exclude the last pairs; `of_part` keeps only one part's pairs.
         part: (k,) for the boundaries "mirror" and "mean", the index of the pencil's part that each pair belongs to (0
@@ -191,8 +194,8 @@ class Eigenpairs(eqx.Module):
 
     @property
     def uncertain(self) -> Bool[Array, " k"]:
-        """Whether each eigenvalue is zero within `rounding`, and may be positive, negative or zero."""
-        return self.kept & (self.rounding > 0) & (jnp.abs(self.eigenvalues) <= self.rounding)
+        """Whether `rounding` is more than 1 % of each eigenvalue; even the sign of the eigenvalue may be uncertain."""
+        return self.kept & (self.rounding > UNCERTAIN * jnp.abs(self.eigenvalues))
 
     @property
     def result(self) -> RESULTS:
@@ -236,10 +239,11 @@ class Eigenpairs(eqx.Module):
         if (uncertain := np.asarray(self.uncertain)).any():
             some = ", ".join(f"{value:.3g}" for value in values[uncertain][:3])
             most, of = float(np.asarray(self.rounding)[uncertain].max()), int(uncertain.sum())
-            stated = "" if self.null_space_known else ", or give `sparse_pencil` the null vectors"
+            own = isinstance(self.space, MatrixSpace) and not self.null_space_known
+            stated = ", or give `sparse_pencil` the null vectors" if own else ""
             sentences.append(
-                f"{of} of {values.size} eigenvalues (λ = {some}{', …' * (of > 3)}) cannot be distinguished from zero: "
-                f"rounding of the matrices to float32 changes them by up to {most:.1e}. Use float64{stated}"
+                f"{of} of {values.size} eigenvalues (λ = {some}{', …' * (of > 3)}) are uncertain: rounding of the "
+                f"matrices to float32 changes them by up to {most:.1e}. Use float64{stated}"
             )
         stretch = _anisotropy(self.pencil) if values.dtype == np.float32 else 1.0
         if (rounding := np.finfo(np.float32).eps * stretch) > _ROUNDED:
@@ -317,7 +321,7 @@ class _Spectrum(NamedTuple):
 def _gaps(xp: Any, spectrum: _Spectrum) -> Any:
     """Return, for each eigenvalue, the largest gap to the next one at which the two count as equal, (k)."""
     values, _, origin, tolerance, rounding = spectrum
-    finfo, length = jnp.finfo(values.dtype), xp.nanmax(values) - origin
+    finfo, length = jnp.finfo(values.dtype), xp.nanmax(values, initial=-xp.inf) - origin
     rounding = xp.where(length <= rounding, rounding, xp.minimum(rounding, length / 1000))
     stored = 4 * finfo.eps * xp.abs(values)
     return xp.maximum(xp.maximum(tolerance * (values - origin), stored), xp.maximum(rounding, finfo.tiny))

@@ -16,7 +16,7 @@ from hks_jax.checks import real_array, require_count
 from hks_jax.compilation import is_concrete_on_cpu, jit_quickly, numpy_where_known
 from hks_jax.eigen.adjoints.adjoint import Scalar
 from hks_jax.eigen.derivative import frame_of_chosen, solved
-from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.eigenpairs import UNCERTAIN, Eigenpairs
 from hks_jax.eigen.inertia import certain_count, count_below, locate, translated
 from hks_jax.eigen.lanczos.block_lanczos import SLICE, BlockLanczos, known_by_weyl
 from hks_jax.eigen.quality import allowed_residuals, indistinct, largest, largest_of, measure_pairs, measured_on_host
@@ -196,7 +196,8 @@ def _pairs(
         no = jnp.zeros(0, bool)
         quality = jnp.zeros(0, values.dtype), no, no, jnp.asarray(1e-6, values.dtype)
     residuals, converged, zero, tolerance = quality
-    small, rounding = _near_zero(*jax.lax.stop_gradient((solved_pencil, vectors, values, zero)), known, solver)
+    held = jax.lax.stop_gradient((solved_pencil, vectors, values + origin, zero))
+    small, rounding = _near_zero(*held, known, solver)
     # While differentiating, JAX may turn a constant array into a Python number.
     following, bound = jax_array(following), jax_array(bound)
     if not known:
@@ -232,7 +233,7 @@ def _translated(
 def _near_zero(
     pencil: SymmetricPencil, vectors: Array, values: Array, zero: Array, known: bool, solver: Eigensolver
 ) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
-    """Return the eigenvalues that are near zero, with 0 for the others, and `Eigenpairs.rounding`.
+    """Return the eigenvalues that are zero within rounding, with 0 for the others, and `Eigenpairs.rounding`.
 
     In float32, eigenvalues that are zero within rounding may be accurate in float64, in which the host computes.
     """
@@ -242,7 +243,8 @@ def _near_zero(
     if not _single_on_host(values, (pencil, vectors, values)):
         return nothing, nothing if known else jnp.where(zero, indistinct(pencil, values.dtype), 0)
     small, rounding = np.zeros((2, values.size), np.float32)
-    where = np.flatnonzero(np.asarray(zero) & (np.arange(values.size) >= (pencil.n_null if known else 0)))
+    near = np.abs(np.asarray(values)) <= float(indistinct(pencil, values.dtype)) / UNCERTAIN
+    where = np.flatnonzero(near & (np.arange(values.size) >= (pencil.n_null if known else 0)))
     if where.size:
         quotients, changes = near_zero(pencil, np.asarray(vectors)[where], solver.in_double)
         # Rounding of the vectors to float32 changes quotients by its square.

@@ -148,8 +148,8 @@ def fit_metric(
         )
     elif noise is not None and ended and misfit > noise**2:
         warn_of_accuracy(
-            f"noise: the fit ended ({result}) with residuals of {(2 * misfit) ** 0.5:.2g}, above the noise {noise:.2g}. "
-            f"{_UNEXPLAINED}, weaker regularisers, or a larger noise"
+            f"noise: the fit ended ({result}) with residuals of {(2 * misfit) ** 0.5:.2g}, above the noise "
+            f"{noise:.2g}. {_UNEXPLAINED}, weaker regularisers, or a larger noise"
         )
     elif noise is None and ended and misfit > max(_EXPLAINED * discretisation, 2 * search.tolerance**2):
         size, error = (2 * misfit) ** 0.5, (2 * discretisation) ** 0.5

@@ -156,7 +156,8 @@ def colour_bar_in(
     """Draw a colour bar in separate axes, with few ticks, powers of ten, and arrows if values exceed its range."""
     low, high = mappable.get_clim()
     drawn: Any = mappable.get_array() if values is None else values
-    extend = ("neither", "min", "max", "both")[(drawn.min() < low) + 2 * (drawn.max() > high)]
+    rounding = 1e-6 * (high - low)  # a range that is symmetric about a centre ends near the least value
+    extend = ("neither", "min", "max", "both")[(drawn.min() < low - rounding) + 2 * (drawn.max() > high + rounding)]
     bar = figure_of(bar_axes).colorbar(mappable, cax=bar_axes, extend=extend, **kwargs)
     formatter = ScalarFormatter(useOffset=False, useMathText=True)
     formatter.set_powerlimits((-3, 4))

@@ -357,6 +357,7 @@ def test_subjects_in_other_units_are_refused_and_open_frames_are_said(study, mon
     np.testing.assert_allclose(values[1], values[0], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_numbers_without_a_unit_are_compared_within_the_study(study, monkeypatch, capsys):
     monkeypatch.setattr(
         "hks_jax.cli.study.tasks.signature_panels", lambda result, path, **_: path.write_text("picture")

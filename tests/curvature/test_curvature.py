@@ -157,6 +157,7 @@ def test_error_bars_of_curvature_contain_the_truth():
     assert np.mean(z < 2) == pytest.approx(0.95, abs=0.04)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [pytest.param(jnp.float32, marks=pytest.mark.slow), jnp.float64])
 def test_no_smooth_field_is_called_noise(dtype):
     fields = [examples.sphere_field(n, 1.0) for n in (9, 40)]

@@ -235,6 +235,7 @@ class TestGradientsByAField:
         (both,) = jax.tree.leaves(jax.vmap(jax.grad(self.of_field))(batch))
         np.testing.assert_allclose(both[1], expected, rtol=1e-10, atol=1e-10)
 
+    @pytest.mark.slow
     def test_adding_to_both_components_changes_the_function_by_twice_the_gradient(self):
         field, one = hj.TensorField(self.grid, self.tensors), np.zeros((6, 5, 2, 2))
         (gradient,) = jax.tree.leaves(jax.grad(self.of_field)(field))
@@ -262,6 +263,7 @@ class TestGradientsByAField:
         dense = hj.assemble(field).stiffness.to_dense()
         np.testing.assert_allclose(dense, dense.T, atol=1e-14)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("kind", [hj.SurfaceMesh, pytest.param(hj.TetMesh, marks=pytest.mark.slow)])
     def test_by_the_metric_of_a_mesh(self, kind):
         vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1.2]], float)

@@ -286,7 +286,8 @@ def test_a_circulant_raises_no_false_alarm():
     assert pairs.eigenvalues[0] == pytest.approx(np.linalg.eigvalsh(matrix)[0], rel=1e-13)
 
 
-@pytest.mark.parametrize("boundary", [pytest.param("mirror", marks=pytest.mark.slow), "mean"])
+@pytest.mark.slow
+@pytest.mark.parametrize("boundary", ["mirror", "mean"])
 def test_an_interval_that_ends_at_an_eigenvalue_of_a_doubled_domain_is_refused(boundary):
     """The pivot that vanishes there has a sign, by which one part was counted within and another without."""
     for seed in (4, 5):

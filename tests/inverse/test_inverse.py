@@ -603,9 +603,8 @@ def _full(grid):
     return hj.TensorField(grid, turning(grid.nodes, 2.0, 0.7))
 
 
-@pytest.mark.parametrize(
-    ("parametrisation", "finer"), [pytest.param("conformal", 1, marks=pytest.mark.slow), ("log-euclidean", 2)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("parametrisation", "finer"), [("conformal", 1), ("log-euclidean", 2)])
 def test_a_target_that_the_metric_does_not_explain_is_told_without_noise(parametrisation, finer):
     grids = [hj.Grid.from_bounds(0, 1, (n, n)) for n in (8, 7 * finer + 1)]
     times = np.array([0.05, 0.2])

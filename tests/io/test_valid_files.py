@@ -100,6 +100,7 @@ def test_tables_of_numbers_with_a_byte_order_mark(tmp_path):
     np.testing.assert_allclose(volume.tensors[0, 0, 0], D, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_voxels_without_an_element_are_counted(tmp_path, capsys):
     mask = np.zeros((7, 4, 3), bool)
     mask[:4], mask[6, 3, 2] = True, True

@@ -132,6 +132,29 @@ def test_too_many_numbers_are_refused_before_they_are_written(tmp_path, monkeypa
         explore(of(signature()), tmp_path / "page.html")
 
 
+def test_all_arrays_at_nodes_are_turned_with_the_volume(tmp_path):
+    """A volume stored left to right shows the numbers of the same volume stored right to left."""
+    shape, rng = (5, 4, 3), np.random.default_rng(2)
+    values, deviation, z, influence = rng.random((4, TIMES.size, *shape))
+    density, pages = rng.random(shape) + 0.5, []
+    for step, affine in ((1, np.eye(4)), (-1, np.diag([-1.0, 1, 1, 1]))):
+        affine[0, 3] = 0 if step == 1 else shape[0] - 1
+        turned = {
+            name: array[..., ::step, :, :]
+            for name, array in {"deviation": deviation, "z": z, "influence": influence, "density": density}.items()
+        }
+        place = TensorVolume(tensors(shape)[::step], (1.0,) * 3, (0.0,) * 3, affine=affine)
+        settings = {"operator": "fick", "metric": "inverse", "normalisation": "raw"}
+        result = Result(place, values[:, ::step], TIMES, arrays=turned, report={"settings": settings})
+        pages.append(explore(result, tmp_path / "page.html").read_text(encoding="utf-8"))
+    for name, dtype in {"values": "<f4", "deviation": "<f4", "z": "<f4", "near": np.uint8}.items():
+        ours, theirs = (block(page, name, dtype) for page in pages)
+        assert len(set(ours)) > 1
+        np.testing.assert_array_equal(ours, theirs)
+    flat = block(pages[0], "values", "<f4").reshape(TIMES.size, -1) / values.reshape(TIMES.size, -1)
+    np.testing.assert_allclose(flat / flat[:, :1], (density / density[0, 0, 0]).ravel()[None].repeat(7, 0), rtol=1e-5)
+
+
 def test_every_file_beside_the_code_is_packaged():
     with open(ROOT / "pyproject.toml", "rb") as stream:
         patterns = tomllib.load(stream)["tool"]["setuptools"]["package-data"]["hks_jax"]

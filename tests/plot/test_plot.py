@@ -78,6 +78,13 @@ def test_scalar_image_colours_by_quantiles():
     assert image.colorbar.extend == "both"
 
 
+def test_a_range_about_a_centre_has_no_arrow_at_the_least_value():
+    values = np.linspace(0.3, 1.5, 121).reshape(11, 11)
+    image = scalar_image(new_figure(3, 3).subplots(), values, Grid((11, 11)), centre=1.0)
+    assert values.min() < image.get_clim()[0] == pytest.approx(0.3)  # 1 − (1 − 0.3) > 0.3
+    assert image.colorbar.extend == "neither"
+
+
 def test_a_constant_is_one_colour():
     grid = Grid((9, 9))
     noise = 1e-12 * np.random.default_rng(0).standard_normal((9, 9))

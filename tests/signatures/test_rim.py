@@ -40,6 +40,7 @@ def test_the_estimate_of_one_problem_is_the_influence_of_straight_sides(strip, b
         assert np.isfinite(hj.boundary_influence(pairs, [1e-5])).all()
 
 
+@pytest.mark.slow
 def test_the_estimate_has_the_influence_of_a_round_rim():
     """Against the eigenpairs of both problems; the default times end where half of the nodes are free."""
     x, y = np.meshgrid(*[np.linspace(-1, 1, 31)] * 2, indexing="ij")

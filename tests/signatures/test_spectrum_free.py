@@ -77,8 +77,7 @@ def test_colouring_keeps_its_bound(shape, boundary, mass, times):
     [
         ("lumped", 2.5, 1),
         pytest.param("consistent", 6.0, 2, marks=pytest.mark.slow),
-        # At t = 1e-4 the error is 6 % above the bound on some machines: docs/spectrum-free.md.
-        pytest.param("lumped", 6.0, 2, marks=[pytest.mark.slow, pytest.mark.xfail(reason="6 % above the bound")]),
+        pytest.param("lumped", 6.0, 2, marks=pytest.mark.slow),
         pytest.param("consistent", 2.5, 1, marks=pytest.mark.slow),
     ],
 )
@@ -117,7 +116,7 @@ def test_tolerances_below_rounding_are_refused():
             np.asarray(hj.hks_spectrum_free(single, [0.005], mass=mass, method=settings))
             - by_all_pairs(pencil, [0.005])
         )
-        assert 0.01 * least < error.max() / flat_scale([0.005], 2).max() <= settings.error[0] <= 1.01 * least
+        assert 0.003 * least < error.max() / flat_scale([0.005], 2).max() <= settings.error[0] <= 1.01 * least
     # The other method has no such tolerance.
     assert np.isfinite(hj.hks_spectrum_free(single, [0.005], tolerance=1e-7)).all()
 

@@ -17,6 +17,7 @@ KINDS = (
     "eigenproblems",
     "matrices",
     "reference",
+    "precision",
     "gradients",
     "counts",
     "estimates",

@@ -250,6 +250,7 @@ def test_noise_alone_is_beyond_two_as_often_as_a_normal_number(field, level, num
     assert ratio.max() < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("field", "level", "worst", "best"),
     [
