@@ -97,6 +97,7 @@ from hks_jax.signatures.truncation import truncation_map as truncation_map
 from hks_jax.spectrum_free.colouring import Colouring as Colouring
 from hks_jax.spectrum_free.heat_diagonal import colouring as colouring
 from hks_jax.spectrum_free.heat_diagonal import hks_spectrum_free as hks_spectrum_free
+from hks_jax.spectrum_free.smoothing import smooth as smooth
 from hks_jax.uncertainty import TensorNoise as TensorNoise
 from hks_jax.uncertainty import Uncertainty as Uncertainty
 from hks_jax.uncertainty import smooth_tensors as smooth_tensors

@@ -116,6 +116,7 @@ CALLS: dict[str, Callable[[], Any]] = {
     "scalar_curvature": lambda: hj.scalar_curvature(field()),
     "scale_invariant_hks": lambda: hj.scale_invariant_hks(pairs(), 3, 16),
     "shape_dna": lambda: hj.shape_dna(pairs()),
+    "smooth": lambda: hj.smooth(field(), TENSORS[..., 0, 0], 2.0),
     "smooth_tensors": lambda: hj.smooth_tensors(GRID, TENSORS, 1.0),
     "sparse_pencil": lambda: hj.sparse_pencil(MATRIX),
     "spectral_filter": lambda: hj.spectral_filter(pairs(), TENSORS[..., 0, 0], lambda x: 1 / (1 + x)),

@@ -19,9 +19,8 @@ from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.arrays import ByKey, nan_is_meant
 from hks_jax.checks import real_array, require_number, require_real
 from hks_jax.compilation import numpy_where_known
-from hks_jax.domain import spd
 from hks_jax.eigen.eigenpairs import Eigenpairs, require_pairs
-from hks_jax.fem.space import GridSpace, mask_for
+from hks_jax.fem.resolution import mean_diffusivity
 from hks_jax.linear.operators import Operator
 from hks_jax.linear.products import inner_products, matmul
 from hks_jax.signatures.filters import Custom
@@ -161,7 +160,7 @@ def energy(pairs: Eigenpairs, f: Any, diffusivity: Any = None) -> ModeEnergies:
     found = _energies(_measure(pairs), fit.rows, known, fit.coefficients, fit.modes, gram, copies)
     energies, residual, share, total = found
     if diffusivity is None:
-        diffusivity = _mean_diffusivity(pairs)
+        diffusivity = mean_diffusivity(pairs.pencil.parts[0].metric, pairs.space, dtype)
     else:
         require_number("diffusivity", diffusivity)
         diffusivity = jnp.asarray(diffusivity, dtype)
@@ -206,22 +205,6 @@ def _lengths(xp: Any, values: Any, diffusivity: Any) -> tuple[Any, Any]:
     positive = values > 0
     lengths = xp.where(positive, xp.sqrt(diffusivity / xp.where(positive, values, 1)), xp.inf)
     return 2 * math.pi * lengths, 4 * math.log(2.0) * lengths
-
-
-def _mean_diffusivity(pairs: Eigenpairs) -> Float[Array, ""]:
-    """Return the mean of trace(T⁻¹)/d over the nodes of a grid with the metric T, or 1."""
-    metric, space = pairs.pencil.parts[0].metric, pairs.space
-    if metric is None or not isinstance(space, GridSpace):
-        return jnp.ones((), pairs.eigenvalues.dtype)
-    return _mean_of(jax.lax.stop_gradient(metric.tensors), mask_for(metric.tensors, space.domain))
-
-
-@numpy_where_known()
-def _mean_of(xp: Any, tensors: Any, domain: Any) -> Any:
-    d = tensors.shape[-1]
-    inverse = spd.inverse(xp.where(domain[..., None, None], tensors, xp.eye(d, dtype=tensors.dtype)))
-    mean = sum(inverse[..., a, a] for a in range(d)) / d
-    return xp.sum(xp.where(domain, mean, 0)) / xp.sum(domain, dtype=tensors.dtype)
 
 
 class _OfEigenvalue(ByKey):
