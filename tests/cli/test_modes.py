@@ -1,4 +1,4 @@
-"""The command modes: its files are what the library computes, on voxels, slices, surfaces and tetrahedra."""
+"""The commands modes and smooth write what the library computes, on voxels, slices, surfaces and tetrahedra."""
 
 import csv
 import json
@@ -156,3 +156,27 @@ def test_maps_that_are_refused(tensors, series, tmp_path, capsys):
     np.save(out / "modes.npy", np.ones(SHAPE))
     assert main([*read, str(out / "modes.npy")]) == 2
     assert "modes.npy: this input file would be replaced by the output" in capsys.readouterr().err
+
+
+def test_maps_are_smoothed_as_by_the_library(tensors, tmp_path, capsys):
+    f = np.random.default_rng(1).normal(size=(*SHAPE, 2))
+    nib.save(nib.Nifti1Image(f, AFFINE), tmp_path / "bold.nii.gz")
+    out, name = tmp_path / "out", str(tmp_path / "bold.nii.gz")
+    volume = hj.io.read_tensors(tensors).with_mask(MASK)
+    command = ["smooth", name, "--tensors", tensors, "-o", str(out), "-q"]
+    for operator, settings in (("fick", {"operator": "fick"}), ("laplace-beltrami", {"metric": "inverse"})):
+        assert main([*command, "--fwhm", "6", "--operator", operator]) == 0
+        found = np.moveaxis(nib.load(out / "smoothed.nii.gz").get_fdata(), -1, 0)
+        field = hj.TensorField.from_diffusion(volume.grid("all"), volume.tensors, **settings)
+        np.testing.assert_allclose(found, hj.smooth(field, np.moveaxis(f, -1, 0), 6.0), atol=1e-5)
+        assert (out / "smoothed.png").stat().st_size > 5000
+    assert main([*command, "--fwhm", "2"]) == 2
+    assert "--fwhm: got 2 on a grid with the spacing 3, which does not resolve it" in capsys.readouterr().err
+    f[3, 3, 2, 1] = np.nan
+    nib.save(nib.Nifti1Image(f, AFFINE), tmp_path / "bold.nii.gz")
+    assert main([*command, "--fwhm", "6"]) == 2
+    assert "got NaN or infinite values at 1 voxels inside the mask" in capsys.readouterr().err
+    assert main(["smooth", name, name, "--tensors", tensors, "--fwhm", "6", "-o", str(out)]) == 2
+    assert "expected one file of maps" in capsys.readouterr().err
+    assert main(["smooth", name, "--tensors", str(out / "smoothed.nii.gz"), "--fwhm", "6", "-o", str(out)]) == 2
+    assert "this input file would be replaced" in capsys.readouterr().err
