@@ -227,7 +227,7 @@ def _translated(
     xp: Any, values: Any, constant: Any, zero: Any, small: Any, following: Any, bound: Any, origin: Any
 ) -> tuple[Any, Any, Any]:
     """Add the origin to values and bounds. Eigenvalues near zero become ``small``, and keep their derivatives."""
-    return values + origin + xp.where(zero, small + (-constant - origin), 0), following + origin, bound + origin
+    return xp.where(zero, small + (values - constant), values + origin), following + origin, bound + origin
 
 
 def _near_zero(

@@ -33,9 +33,9 @@ def check(seed: int) -> Outcome:
         warnings.simplefilter("always")
         pairs = solve()
     values = np.asarray(pairs.eigenvalues, float)
-    assert not (np.diff(values) < 0).any(), f"{what}: eigenvalues are not ascending"
     if any("cuts a multiple" not in str(each.message) for each in told):
         return "told"
+    assert not (np.diff(values) < 0).any(), f"{what}: eigenvalues are not ascending"
     wrong = ~(np.abs(values - exact[:k]) <= allowed)
     assert not wrong.any(), f"{what} by {pairs.solver_name}: got {values[wrong]}, exact are {exact[:k][wrong]}"
     return "right"
