@@ -21,6 +21,7 @@ from hks_jax.checks import real_array, require_number, require_real
 from hks_jax.compilation import numpy_where_known
 from hks_jax.eigen.eigenpairs import Eigenpairs, require_pairs
 from hks_jax.fem.resolution import mean_diffusivity
+from hks_jax.linear import lapack
 from hks_jax.linear.operators import Operator
 from hks_jax.linear.products import inner_products, matmul
 from hks_jax.signatures.filters import Custom
@@ -369,10 +370,19 @@ def _gram(measure: Any, modes: Any, measured: Any, even: Any, copies: int) -> Fl
 @numpy_where_known()
 def _solved(xp: Any, gram: Any, products: Any) -> tuple[Any, Any]:
     """Return the coefficients, NaN if they are not determined, and the least eigenvalue of the Gram matrix."""
-    least = xp.min(xp.linalg.eigvalsh(gram if xp is np else jax.lax.stop_gradient(gram)))
-    determined = least > _negligible(gram.dtype)
-    solvable = xp.where(determined, gram, xp.eye(len(gram), dtype=gram.dtype))
-    return xp.where(determined, xp.linalg.solve(solvable, products.T).T, xp.nan), least
+    values, vectors = np.linalg.eigh(gram) if xp is np else lapack.eigh(jax.lax.stop_gradient(gram))
+    determined = values[0] > _negligible(gram.dtype)
+    divisors = xp.where(determined, values, 1)[:, None]
+
+    def inverse(columns: Any) -> Any:
+        return matmul(vectors, matmul(vectors.T, columns) / divisors)
+
+    if xp is np:
+        columns = inverse(products.T)
+    else:
+        image, solve = partial(matmul, gram), lambda _, columns: inverse(columns)
+        columns = jax.lax.custom_linear_solve(image, products.T, solve, symmetric=True)
+    return xp.where(determined, columns.T, xp.nan), values[0]
 
 
 def _negligible(dtype: Any) -> float:

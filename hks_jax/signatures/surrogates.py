@@ -11,6 +11,7 @@ from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.arrays import nan_is_meant
 from hks_jax.checks import require_count, require_real
 from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.linear import lapack
 from hks_jax.signatures.modes import energy, fitted, reconstruct
 from hks_jax.traced import is_traced
 
@@ -78,8 +79,9 @@ def _random_rotations(
     within = (labels[:, None] == labels[None]) & turns[:, None] & turns[None]
     stays = jnp.diag((~turns).astype(dtype))
     entries = jnp.where(within[None], jax.random.normal(key, (n, k, k), dtype), stays[None])
-    q, r = jnp.linalg.qr(entries)
-    return q * jnp.where(jnp.diagonal(r, axis1=1, axis2=2) < 0, -1, 1)[:, None, :].astype(dtype)
+    q = jax.vmap(lapack.orthonormal_columns)(entries)
+    of_r = jnp.sum(q * entries, axis=1)  # the diagonal of R = QᵀA
+    return q * jnp.where(of_r < 0, -1, 1)[:, None, :].astype(dtype)
 
 
 def _checked_groups(groups: Any, k: int) -> Array:

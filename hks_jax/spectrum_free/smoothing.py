@@ -37,10 +37,12 @@ def smooth(
     In a constant tensor D, heat spreads as a Gaussian, whose full width at half maximum along an axis with the
     diffusivity a is 4√(ln2 · a t). The time t is that in which the mean diffusivity gives the full width `fwhm`; along
     fibres maps are smoothed more, and across them less. Fluid diffuses faster than tissue, and raises the mean; exclude
-    it by the mask. The flow is computed by Chebyshev polynomials of the matrices
-    with lumped mass, without eigenpairs, and equals `heat_flow` with all eigenpairs. The integral of f with the mass is
-    kept, except under Dirichlet conditions; it is the plain integral for a field with ``operator="fick"``. The result
-    is differentiable with respect to f. It is NaN outside the mask, and 0 at Dirichlet nodes.
+    it by the mask.
+
+    The flow is computed by Chebyshev polynomials of the matrices with lumped mass, without eigenpairs, and equals
+    `heat_flow` with all eigenpairs. The integral of f with the mass is kept, except under Dirichlet conditions; it is
+    the plain integral for a field with ``operator="fick"``. The result is differentiable with respect to f. It is NaN
+    outside the mask, and 0 at Dirichlet nodes.
 
     Args:
         domain: a tensor field, best with ``operator="fick"``, or a mesh.
