@@ -48,9 +48,9 @@ def smooth(
         domain: a tensor field, best with ``operator="fick"``, or a mesh.
         f: (*shape), or (…, *shape) for several maps, such as a time series. Values outside the mask are not used.
         fwhm: the full width at half maximum, in the unit of the domain's coordinates (mm for voxels in mm), at least
-            the greatest spacing of a grid. A single voxel spreads as the Gaussian up to 5 % of its greatest value for
-            10 spacings and a ratio 3 of the tensor's eigenvalues, and up to 10 % for 6 spacings; the covariance is
-            right for all. Below about two spacings, values may become slightly negative.
+            the greatest spacing of a grid. If the ratio of the tensor's eigenvalues is 3, a single voxel spreads as the
+            Gaussian up to 3 % of its greatest value for a width of 10 spacings, 6 % for 8 and 12 % for 6; the
+            covariance is right for all. For narrower widths, values may become slightly negative.
         boundary: see `assemble`. Maps are smoothed within the mask only; ``"mirror"`` and ``"mean"`` reflect them,
             which is as under ``"neumann"``.
         diffusivity: the D of the time FWHM²/(16 ln2 D). None means the mean of trace(T⁻¹)/d over the nodes of a grid

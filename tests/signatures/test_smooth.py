@@ -61,6 +61,7 @@ def test_the_flow_of_all_eigenpairs_and_the_total(boundary, rng):
         np.testing.assert_allclose(after, before, rtol=1e-8, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_on_meshes_in_single_precision_and_derivatives(rng):
     mesh = hj.examples.sphere_mesh(4)
     x = np.asarray(mesh.vertices)[:, 0]

@@ -158,6 +158,7 @@ def test_maps_that_are_refused(tensors, series, tmp_path, capsys):
     assert "modes.npy: this input file would be replaced by the output" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_maps_are_smoothed_as_by_the_library(tensors, tmp_path, capsys):
     f = np.random.default_rng(1).normal(size=(*SHAPE, 2))
     nib.save(nib.Nifti1Image(f, AFFINE), tmp_path / "bold.nii.gz")
