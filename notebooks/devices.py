@@ -1,7 +1,7 @@
 # %% [markdown]
 # # Several devices
 #
-# Batches, times, eigenvectors and space can be distributed over the devices of a mesh with one axis. The results
+# Batches, times and eigenvectors can be distributed over the devices of a mesh with one axis. The results
 # equal those of one device up to rounding. If there is only one CPU, JAX presents it as eight devices here. This
 # shows the distribution of data, but does not make the computation faster.
 
@@ -95,79 +95,21 @@ assert together.converged.all()
 assert difference(together.eigenvalues, one.eigenvalues) < 1e-9
 assert difference(hj.hks(together, [0.1, 1.0]), hj.hks(one, [0.1, 1.0])) < 1e-8
 
-# %% [markdown]
-# ## Space
-#
-# For a field larger than a device, each device holds a slab of the grid. Every product with the stiffness matrix
-# exchanges two planes of nodes. This example computes columns of the heat kernel. In this time heat does not spread
-# over eight nodes. Therefore sources with a spacing of eight nodes share a column, and 512 columns contain the
-# signature of all nodes.
-
 # %%
-tall = hj.Grid((5 * mesh.size - 2, 16, 10), 1.0)  # the last slab is padded
-u = np.moveaxis(tall.nodes, -1, 0)
-layered = hj.TensorField(tall, (1.5 + 0.5 * np.sin(0.4 * u[0]))[..., None, None] * np.eye(3))
-pencil = hj.assemble(layered, mass="lumped")
-row_sums = np.asarray(pencil.mass.entries).reshape(tall.shape)
-colour = np.ravel_multi_index(np.indices(tall.shape) % 8, (8, 8, 8))
-sources = (colour[..., None] == np.arange(512)) / row_sums[..., None]
-time = 0.5
-
-
-def columns_on(mesh):
-    slabs = hj.devices.Slabs(mesh, tall.shape, pencil.space.periodic)
-    K, D, start = slabs.split(pencil.stiffness.coefficients, 1), slabs.split(row_sums), slabs.split(sources)
-    return slabs, slabs.join(hj.devices.heat_columns(slabs, K, D, start, [time]), 1)[0]
-
-
-slabs, heat = columns_on(mesh)
-of_nodes = np.take_along_axis(np.asarray(heat), colour[..., None], axis=-1)[..., 0]
-assert difference(heat, columns_on(alone)[1]) < 1e-12
-assert difference(of_nodes, hj.hks_spectrum_free(pencil, [time], tolerance=1e-6)[0]) < 1e-5
-
-# %% [markdown]
-# ## The work of each device
-#
-# This cell prints the flops of one device's program for a stencil product, as the compiler counts them, and the
-# numbers that the device sends. The flops are inversely proportional to the number of devices. The number of planes
-# is constant, because each slab has two neighbours.
-
-# %%
-sizes = [p for p in (1, 2, 4, 8) if p <= mesh.size]
-flops, sent = [], []
-for p in sizes:
-    part = hj.devices.Slabs(jax.sharding.Mesh(np.array(devices[:p]), ("devices",)), (8 * 16, 16, 10), (False,) * 3)
-    shapes = [jax.ShapeDtypeStruct(shape, float) for shape in ((27, *part.padded_shape), (*part.padded_shape, 16))]
-    compiled = jax.jit(part.product).lower(*shapes).compile()
-    flops.append(compiled.cost_analysis()["flops"])
-    sent.append(2 * int(np.prod(part.local_shape[1:])) * 16 if p > 1 else 0)
-    print(f"{p} devices: {flops[-1] / 1e6:.1f} Mflop each, {sent[-1]} numbers sent by an inner one")
-assert np.allclose(np.array(flops) * sizes, flops[0], rtol=0.01)
-
-# %%
-figure = hj.plot.new_figure(11, 3.6)
-batches, space, work = figure.subplots(1, 3)
+figure = hj.plot.new_figure(8, 3.6)
+batches, space = figure.subplots(1, 2)
 for shard in signatures.addressable_shards:
     first = shard.index[0].start
     batches.add_patch(Rectangle((shard.device.id - 0.45, first - 0.45), 0.9, 1.9, facecolor="tab:blue", alpha=0.6))
     batches.text(shard.device.id, first + 0.5, f"{first}, {first + 1}", ha="center", va="center", fontsize="x-small")
 batches.set(xlim=(-0.7, mesh.size - 0.3), ylim=(-1, 2 * mesh.size), xlabel="device", ylabel="metric")
 batches.set_title("a batch")
-hj.plot.scalar_image(space, of_nodes[:, :, 5], hj.Grid(tall.shape[:2], 1.0), colorbar=False)
-edges = slabs.thickness * np.arange(1, mesh.size) - 0.5
-space.vlines(edges, *space.get_ylim(), colors="white", linewidth=1.5)
+hj.plot.scalar_image(space, hj.hks(together, [0.1])[0, :, :, 3], hj.Grid(box.shape[:2], 0.1), colorbar=False)
+space.vlines(0.1 * (2 * np.arange(1, mesh.size) - 0.5), *space.get_ylim(), colors="white", linewidth=1.5)
 for index in range(mesh.size):
-    space.text(slabs.thickness * (index + 0.4), 16.5, str(index), ha="center", va="bottom")
+    space.text(0.1 * (2 * index + 0.5), 0.77, str(index), ha="center", va="bottom")
 space.set_title("the signature in slabs\n")
-work.plot(sizes, np.array(flops) / 1e6, "o-", label="Mflop")
-work.plot(sizes, np.array(sent) / 1e3, "s--", label="thousands of numbers sent")
-work.set(xscale="log", yscale="symlog", xlabel="devices", ylim=(0, None))
-work.set_xticks(sizes, [str(p) for p in sizes])
-work.minorticks_off()
-work.legend(frameon=False, fontsize="small")
-work.set_title("one device, one stencil product")
 assert len(batches.patches) == mesh.size
-assert edges[-1] < tall.shape[0] <= slabs.padded_shape[0]
 hj.plot.save_figure(figure, "devices.png")
 
 # %% [markdown]

@@ -25,14 +25,14 @@ import numpy as np
 
 from hks_jax import __version__
 from hks_jax.cache import keep_compiled
-from hks_jax.cli import convert, curvature, demo, explore, fit, hks, info, modes, paper, plot, smooth, spectrum, stats
+from hks_jax.cli import convert, curvature, demo, explore, fit, hks, info, modes, plot, smooth, spectrum, stats
 from hks_jax.cli.inputs import require_inputs_kept
 from hks_jax.cli.options import SPELLED, add_command, as_options
 from hks_jax.cli.outputs import show
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.study import batch
 
-COMMANDS = (hks, modes, smooth, spectrum, curvature, fit, batch, stats, plot, explore, info, convert, demo, paper)
+COMMANDS = (hks, modes, smooth, spectrum, curvature, fit, batch, stats, plot, explore, info, convert, demo)
 """A module for each command: its docstring is the help text, `OPTIONS` lists its options, and `run` runs it.
 
 The function `writes` of commands with input files returns the files that the command may write.
@@ -68,8 +68,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code: 0 success, 1 failed computation, 2 bad input, 130 interrupt.
 
     Results are written atomically and together at the end, so a failed command writes no file, except for the files of
-    `paper` and `batch`, the checkpoint of `fit` and the eigenpairs of `hks`. Pictures are drawn after the results are
-    written. No command replaces its input.
+    `batch`, the checkpoint of `fit` and the eigenpairs of `hks`. Pictures are drawn after the results are written. No
+    command replaces its input.
     """
     argv, parser = sys.argv[1:] if argv is None else argv, build_parser()
     if not argv:

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.compilation import jit_quickly, numpy_where_known
@@ -16,12 +16,12 @@ from hks_jax.eigen.adjoints.adjoint import Adjoint, OfRows, Rows, Scalar, Values
 from hks_jax.eigen.adjoints.factorised_adjoint import InteriorAdjoint
 from hks_jax.eigen.lanczos.block_lanczos import first_from_origin
 from hks_jax.eigen.quality import indistinct
+from hks_jax.eigen.rotations import gaps
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report
-from hks_jax.fem.pencil import AnyPencil, Pencil
+from hks_jax.fem.pencil import Pencil
 from hks_jax.linear import lapack
 from hks_jax.linear.linear_map import first_order_only, with_transpose
 from hks_jax.linear.loops import one_by_one
-from hks_jax.linear.operators import Operator
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import inner_products, matmul
 from hks_jax.traced import is_traced
@@ -36,41 +36,33 @@ _ON_HOST = 1 << 22
 @partial(jax.custom_jvp, nondiff_argnums=(0, 2, 3, 4, 5, 6))
 def solved(
     solver: Eigensolver, pencil: SymmetricPencil, k: int, extra: int, interior: bool, throw: bool, report: Report
-) -> tuple[Values, Vectors, Vectors, Scalar, Scalar]:
-    """Return k eigenvalues, their eigenvectors, the frame, the next eigenvalue, and a certified bound.
+) -> tuple[Values, Vectors, Scalar, Scalar]:
+    """Return k eigenvalues, the frame of their eigenvectors, the next eigenvalue, and a certified bound.
 
     The pairs are the k lowest eigenpairs or, if ``interior``, the first k above the origin of a `LocatedPencil`. The
-    frame is equal to the eigenvectors, but its derivative excludes rotations of the k eigenvectors among themselves.
-    The next eigenvalue is infinite unless ``extra`` = 1. The solver certifies that none of the k eigenvalues is missing
-    below the bound. Derivatives treat the next eigenvalue and the bound as constants. Derivatives whose linear solves
-    do not converge are NaN, and raise an error if ``throw`` is set, or else cause a warning if values are concrete.
+    frame is equal to the eigenvectors, but its derivative excludes rotations of the k eigenvectors among themselves,
+    which `hks_jax.eigen.rotations` adds. The next eigenvalue is infinite unless ``extra`` = 1. The solver certifies
+    that none of the k eigenvalues is missing below the bound. Derivatives treat the next eigenvalue and the bound as
+    constants. Derivatives whose linear solves do not converge are NaN, and raise an error if ``throw`` is set, or else
+    cause a warning if values are concrete.
     """
     values, vectors, complete_below = _computed(solver, pencil, k, extra, interior, report)
-    values, vectors, following = _cut(values, vectors, k)
-    return values, vectors, vectors, following, complete_below
+    return *_cut(values, vectors, k), complete_below
 
 
 # Let fᵢ = (dK − λᵢ dM) φᵢ, called the force. From Kφᵢ = λᵢMφᵢ and φᵢᵀMφⱼ = δᵢⱼ it follows that
 #
 #     dλᵢ = φᵢᵀfᵢ,    dφᵢ = −½ (φᵢᵀ dM φᵢ) φᵢ + Σ_{j≠i} φⱼ (φⱼᵀfᵢ)/(λᵢ − λⱼ).
 #
-# The terms of dφᵢ for computed eigenvectors φⱼ are evaluated directly. The sum xᵢ of all other terms of dφᵢ solves
+# The derivative of the frame has only the terms of dφᵢ with j > k. Its terms for the guard pairs, which the solver
+# computes beyond k, are evaluated directly. The sum xᵢ of all other terms solves
 #
 #     (K − λᵢM) xᵢ = −Q fᵢ,   Φᵀ M xᵢ = 0,   Q = I − MΦΦᵀ,
 #
-# on the M-orthogonal complement of the computed eigenvectors Φ, where K − λᵢM is positive definite. Reverse mode uses
-# the symmetry of the map fᵢ ↦ xᵢ. The solver computes some guard pairs beyond k, so that λᵢ is not close to the
-# eigenvalues on the complement of Φ. In the interior of a spectrum, the complement of Φ has eigenvalues on both sides
-# of λᵢ. So in the interior, at most half of the guard pairs lie below the origin, and the others follow the k pairs.
-#
-# If λᵢ = λⱼ and j ≠ i, the coefficient of φⱼ in dφᵢ is arbitrary (a gauge), because every basis of the eigenspace is
-# valid. The derivative rule sets gauge coefficients to −½ φⱼᵀ dM φᵢ, which keeps Φ M-orthonormal and is never NaN. A
-# coefficient also counts as a gauge if |λᵢ − λⱼ| is below √ε (λ − λ₀), where λ is the larger of the two eigenvalues and
-# λ₀ the lowest of all, because a division by so small a gap would lose all digits. So dφᵢ is a derivative only if λᵢ is
-# simple. For equal eigenvalues, only the sum of their dλᵢ has a meaning. Spectral functions do not depend on the basis,
-# so their derivatives must not contain gauge coefficients. Derivatives of spectral functions use the frame, whose
-# derivative has only the terms of dφᵢ with j > k (hks_jax/signatures/spectral_functions.py). `of_simple` replaces
-# eigenvector derivatives with gauge coefficients by NaN.
+# on the M-orthogonal complement of all computed eigenvectors Φ, where K − λᵢM is positive definite. Reverse mode uses
+# the symmetry of the map fᵢ ↦ xᵢ. Because of the guard pairs, λᵢ is not close to the eigenvalues on the complement of
+# Φ. In the interior of a spectrum, the complement of Φ has eigenvalues on both sides of λᵢ. So in the interior, at most
+# half of the guard pairs lie below the origin, and the others follow the k pairs.
 @solved.defjvp
 def _solved_jvp(
     solver: Eigensolver, k: int, extra: int, interior: bool, throw: bool, report: Report, primals: Any, changes: Any
@@ -89,7 +81,7 @@ def _solved_jvp(
     eigenvalues, functions, following = _cut(values, vectors, k)
     tangents = tangents_of(adjoint, on_failure, prepared, pencil, change, values, vectors, functions)
     constants = following if extra else jnp.full_like(following, jnp.inf), complete_below
-    return (eigenvalues, functions, functions, *constants), (*tangents, *map(jnp.zeros_like, constants))
+    return (eigenvalues, functions, *constants), (*tangents, *map(jnp.zeros_like, constants))
 
 
 def _computed(
@@ -113,9 +105,9 @@ def _solves(pencil: SymmetricPencil, k: int, p: int) -> bool:
     return p < pencil.size and pencil.n_fixed < k
 
 
-def _shapes(*args: Any) -> tuple[Any, Any, Any]:
+def _shapes(*args: Any) -> tuple[Any, Any]:
     functions = args[-1]
-    return jax.ShapeDtypeStruct((len(functions),), functions.dtype), functions, functions
+    return jax.ShapeDtypeStruct((len(functions),), functions.dtype), functions
 
 
 def _numpy_rule(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
@@ -126,7 +118,7 @@ def _numpy_rule(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> A
         return None
     change, k = x[4], len(functions)
     eigenvalues, guards = values[:k, None], vectors[k:]
-    apart, inverse = _gaps(np, values, k, np.asarray(indistinct(pencil, values.dtype)))
+    _, inverse = gaps(np, values, k, np.asarray(indistinct(pencil, values.dtype)))
 
     def outside(rhs: np.ndarray) -> np.ndarray:
         if not _solves(pencil, k, len(values)):
@@ -144,16 +136,11 @@ def _numpy_rule(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> A
     if y is None:
         moved = (change.mass.to_scipy() @ functions.T).T
         force = (change.stiffness.to_scipy() @ functions.T).T - eigenvalues * moved
-        into, frame = force @ functions.T, onto(force)
-        within = np.where(apart[:, :k], inverse[:, :k] * into, -(moved @ functions.T) / 2)
-        return np.diagonal(into), within @ functions + frame, frame
+        return np.sum(functions * force, axis=1), onto(force)
     # Reverse mode is the transpose of the computation above.
-    of_values, of_vectors, of_frame = y
-    within = of_vectors @ functions.T
-    into = np.where(apart[:, :k], inverse[:, :k] * within, 0) + np.diag(of_values)
-    force = into @ functions + onto(of_vectors + of_frame)
-    moved = np.where(apart[:, :k], 0, -within / 2) @ functions - eigenvalues * force
-    return change_of(change, functions, force, moved)
+    of_values, of_frame = y
+    force = of_values[:, None] * functions + onto(of_frame)
+    return change_of(change, functions, force, -eigenvalues * force)
 
 
 def change_of(change: SymmetricPencil, x: Rows, *p: Rows) -> SymmetricPencil:
@@ -161,14 +148,6 @@ def change_of(change: SymmetricPencil, x: Rows, *p: Rows) -> SymmetricPencil:
     zeros = jax.tree.map(lambda like: jax.device_put(np.zeros(like.shape, like.dtype)), change)
     matrices = tuple(matrix.outer(each, x) for matrix, each in zip((zeros.stiffness, zeros.mass), p, strict=True))
     return eqx.tree_at(lambda pencil: (pencil.stiffness, pencil.mass), zeros, matrices)
-
-
-def _gaps(xp: Any, values: Any, k: int, rounding: Any) -> tuple[Any, Any]:
-    """Return the mask (k, p) of pairs of distinct eigenvalues, and 1/(λᵢ − λⱼ), which is 0 for equal eigenvalues."""
-    gap, above = values[:k, None] - values[None], values - xp.nanmin(values)
-    least = xp.sqrt(xp.finfo(values.dtype).eps) * xp.maximum(above[:k, None], above[None])
-    apart = xp.abs(gap) > xp.maximum(least, rounding)
-    return apart, xp.where(apart, 1 / xp.where(apart, gap, 1), 0)
 
 
 # Without the checkpoint, reverse mode would store copies of the eigenvectors.
@@ -183,8 +162,8 @@ def tangents_of(
     values: Values,
     vectors: Vectors,
     functions: Rows,
-) -> tuple[OfRows, Rows, Rows]:
-    """Return the tangents of the first k of p computed eigenvalues, their eigenvectors, and the frame of `solved`.
+) -> tuple[OfRows, Rows]:
+    """Return the tangents of the first k of p computed eigenvalues, and of the frame of `solved`.
 
     ``prepared`` is the result of `Adjoint.prepare`. ``functions`` are the first k vectors, passed separately because
     slicing ``vectors`` would copy the slice.
@@ -193,10 +172,7 @@ def tangents_of(
     eigenvalues, guards = values[:k], vectors[k:]
     moved = change.mass.apply(functions)
     force = change.stiffness.apply(functions) - eigenvalues[:, None] * moved
-    apart, inverse = _gaps(jnp, values, k, indistinct(pencil, values.dtype))
-    # Inner products with the guards are separate, because reverse mode of the frame needs no other inner products.
-    into = inner_products(functions, force)
-    within = jnp.where(apart[:, :k], inverse[:, :k] * into, -inner_products(functions, moved) / 2)
+    _, inverse = gaps(jnp, values, k, indistinct(pencil, values.dtype))
 
     # `onto_guards` is symmetric, so it is its own transpose. JAX's automatic transpose would be several times slower.
     def onto_guards(force: Rows) -> Rows:
@@ -213,7 +189,7 @@ def tangents_of(
         free = np.arange(k)[:, None] >= pencil.n_fixed
         rhs = jnp.where(free, -force, 0)
         frame = frame + jnp.where(free, jax.lax.custom_linear_solve(lambda x: x, rhs, solve, symmetric=True), 0)
-    return jnp.diagonal(into), matmul(within, functions) + frame, frame
+    return jnp.sum(functions * force, axis=1), frame
 
 
 # `one_by_one` needs the same function object in every call; so the next two functions are at module level.
@@ -265,61 +241,3 @@ def _with_null_modes(xp: Any, mass: Any, nulls: Any, values: Any, vectors: Any) 
     vectors = vectors / xp.sqrt(1 - xp.sum(share * share, axis=1, keepdims=True))
     n_null = len(nulls)
     return xp.concatenate([xp.zeros_like(values[:n_null]), values[n_null:]]), xp.concatenate([nulls, vectors[n_null:]])
-
-
-@jax.custom_jvp
-def frame_of_chosen(vectors: Rows, mass: Operator, chosen: Bool[Array, " k"]) -> Rows:
-    """Return the vectors, with a derivative that excludes rotations of the chosen vectors among themselves.
-
-    The derivative contains rotations of the chosen vectors towards the vectors that are not chosen.
-    """
-    return vectors
-
-
-@frame_of_chosen.defjvp
-def _frame_of_chosen_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    vectors, mass, chosen = first_order_only(primals)
-    change = tangents[0]
-    inside = jnp.where(chosen, products_with_constants(mass.apply(change), vectors), 0)
-    return vectors, change - matmul(inside, vectors)
-
-
-# JAX's automatic transpose of the inner products would multiply by the transposed vectors, which takes twice as long.
-def products_with_constants(images: Float[Array, "b n_dof"], vectors: Rows) -> Float[Array, "b k"]:
-    """Return the inner products of rows of ``images`` and ``vectors``; derivatives treat ``vectors`` as constant."""
-    return with_transpose(partial(inner_products, vectors), lambda mix: matmul(mix, vectors), images)
-
-
-@jax.custom_jvp
-def of_simple(
-    vectors: Rows, values: OfRows, following: Scalar, kept: Bool[Array, " k"], part: Any, pencil: AnyPencil
-) -> Rows:
-    """Return the vectors. A nonzero derivative of a vector becomes NaN unless its eigenvalue is simple and kept."""
-    return vectors
-
-
-# For equal eigenvalues λᵢ = λⱼ = λ, the derivative of Σᵢ f(λᵢ) φᵢ(x)² contains f'(λ) φᵢ φⱼ φᵢᵀ(dK − λ dM)φⱼ. The
-# derivatives dλᵢ give only the terms with i = j. Rotations of the eigenvectors of λ give no terms, because they do not
-# change the sum of their φᵢ(x)². So no finite derivative of eigenvectors gives the terms with i ≠ j.
-@of_simple.defjvp
-def _of_simple_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    vectors, values, following, kept, part, pencil = primals
-    rounding = [indistinct(each, values.dtype) for each in pencil.parts]
-    multiple = _is_multiple(values, following, kept, part, rounding, pencil.parts[0].n_fixed > 0)
-
-    def undefined(x: Rows) -> Rows:
-        return jnp.where((multiple & jnp.any(x != 0, axis=1))[:, None], jnp.nan, x)
-
-    return vectors, with_transpose(undefined, undefined, tangents[0])
-
-
-@numpy_where_known(static_argnums=5)
-def _is_multiple(xp: Any, values: Any, following: Any, kept: Any, part: Any, rounding: Any, fixed: bool) -> Any:
-    """Return the mask (k) of pairs that are not kept or whose eigenvalue is multiple, except fixed null vectors."""
-    size = xp.maximum(xp.abs(values), values - values[:1])
-    least = xp.maximum(xp.finfo(values.dtype).eps ** 0.5 * size, xp.max(xp.stack(rounding)))
-    near = xp.abs(values[:, None] - values[None]) <= least[:, None]
-    if part is not None:
-        near &= part[:, None] == part[None]
-    mixed = (xp.sum(near, axis=1) > 1) & ~((values == 0) & fixed)  # perturbations do not change fixed null vectors
-    return mixed | (following - values <= least) | ~kept

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hks_jax.arrays import jax_array
-from hks_jax.eigen.derivative import frame_of_chosen
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.eigen.one_pencil import solve_lowest, widened
+from hks_jax.eigen.rotations import with_rotations
 from hks_jax.eigen.solver import Dense, Eigensolver, Report, Status
 from hks_jax.fem.pencil import MirrorPencil
 from hks_jax.traced import is_traced
@@ -83,7 +83,10 @@ def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: i
     order = jnp.argsort(jnp.concatenate(_sorted_by(pencil, solved)))
     lowest, ends = order[:k], np.cumsum(sizes)[:-1]
     chosen = jnp.split(jnp.zeros(values.size, bool).at[lowest].set(True), ends)
-    frames = [frame_of_chosen(p.vectors, part.mass, c) for p, part, c in zip(solved, pencil.parts, chosen, strict=True)]
+    frames = [  # a chosen vector also rotates towards computed vectors that are not chosen
+        with_rotations(p.frame, jax.lax.stop_gradient(p.eigenvalues), c[:, None] & ~c, None, p.pencil)
+        for p, c in zip(solved, chosen, strict=True)
+    ]
 
     def together(rows: list[Float[Array, "_ _"]]) -> Float[Array, "k n_dof"]:
         # An eigenfunction has norm 1 on the domain doubled m times, hence norm 1/√2ᵐ on the domain itself.
@@ -91,18 +94,17 @@ def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: i
         return jnp.concatenate(of_all)[lowest] / math.sqrt(len(solved))
 
     return Eigenpairs(
-        values[lowest],
-        together([pairs.vectors for pairs in solved]),
-        together(frames),
-        jnp.concatenate([pairs.residuals for pairs in solved])[lowest],
-        jnp.concatenate([pairs.converged for pairs in solved])[lowest],
-        jnp.concatenate([pairs.rounding for pairs in solved])[lowest],
+        eigenvalues=values[lowest],
+        residuals=jnp.concatenate([pairs.residuals for pairs in solved])[lowest],
+        converged=jnp.concatenate([pairs.converged for pairs in solved])[lowest],
+        rounding=jnp.concatenate([pairs.rounding for pairs in solved])[lowest],
         kept=jnp.ones(k, bool),
-        part=jax_array(np.repeat(np.arange(len(solved)), sizes))[lowest],
         next_eigenvalue=jax.lax.stop_gradient(values[order[k]]) if extra else jnp.asarray(jnp.inf, values.dtype),
         complete_below=_complete_below(pencil, solved, values[order[k + extra - 1 :][:1]], k + extra),
         spectral_origin=solved[0].spectral_origin,
         multiplet_tolerance=jnp.max(jnp.stack([pairs.multiplet_tolerance for pairs in solved])),
+        part=jax_array(np.repeat(np.arange(len(solved)), sizes))[lowest],
+        frame=together(frames),
         pencil=pencil,
         solver_name=" + ".join(dict.fromkeys(pairs.solver_name for pairs in solved)),
         lowest=solved[0].lowest,

@@ -2,14 +2,12 @@
 
 from typing import Any, get_args
 
-import equinox as eqx
 import jax
 import numpy as np
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import require_static
 from hks_jax.eigen.automatic import choose_solver, choose_solvers
-from hks_jax.eigen.derivative import of_simple
 from hks_jax.eigen.doubled import merge, solve_doubled
 from hks_jax.eigen.eigenpairs import RESULTS, SPARE, Eigenpairs, MultipletChoice, truncate
 from hks_jax.eigen.inertia import checked_pencil
@@ -103,8 +101,7 @@ def eigenpairs(
                 "Use a smaller k or a finer grid"
             )
         pairs = _lowest(pencil, int(number), solver, multiplet, throw, report)
-    gauge = pairs.eigenvalues, pairs.next_eigenvalue, pairs.kept, pairs.part, pairs.pencil
-    pairs = eqx.tree_at(lambda p: p.vectors, pairs, of_simple(pairs.vectors, *gauge)).on(pencil)
+    pairs = pairs.on(pencil)
     known = jax.lax.stop_gradient(pairs)
     result = known.result
     if is_traced(known.eigenvalues):

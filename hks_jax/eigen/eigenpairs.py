@@ -12,6 +12,7 @@ from hks_jax.arrays import describe_array
 from hks_jax.compilation import numpy_where_known
 from hks_jax.domain.tensor_checks import MANY
 from hks_jax.eigen.quality import indistinct
+from hks_jax.eigen.rotations import of_simple, with_rotations
 from hks_jax.fem.pencil import AnyPencil
 from hks_jax.fem.space import FunctionSpace, MatrixSpace
 from hks_jax.traced import is_traced
@@ -46,17 +47,12 @@ class RESULTS(eqx.Enumeration):
 class Eigenpairs(eqx.Module):
     """The k lowest eigenpairs of Kφ = λMφ, or all eigenpairs in an interval; a pytree.
 
-    The derivatives of signatures with respect to the matrices use `pencil` and `frame`, not `eigenvalues` and
-    `vectors`. So do not rescale `eigenvalues` or `vectors`: derivatives of signatures would then refer to the new
-    arrays, not to the matrices. Rescale times or the pencil instead.
+    The derivatives of signatures with respect to the matrices use `pencil` and `frame`, not `eigenvalues`. So do not
+    rescale `eigenvalues` or `frame`: derivatives of signatures would then refer to the new arrays, not to the matrices.
+    Rescale times or the pencil instead.
 
     Attributes:
         eigenvalues: (k,) in ascending order, in 1/(metric length)²; exactly 0 for null vectors.
-        vectors: (k, n_dof) coefficients of the eigenfunctions, with φᵢᵀMφⱼ = δᵢⱼ. For the boundaries "mirror" and
-            "mean", M is the mass of the domain doubled m times; on the domain itself, the norm of each φᵢ is 1/√2ᵐ.
-        frame: (k, n_dof) the values of `vectors`, but with a derivative that excludes rotations of eigenvectors among
-            themselves, which are singular at multiple eigenvalues. Derivatives of signatures include the effect of such
-            rotations by divided differences.
         residuals: (k,) ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁), where λ₁ is the first positive eigenvalue. In an interval, or if
             the null space is unknown, max(λ, λ₁) is replaced by the larger of two numbers: the mean gap of the
             eigenvalues, and the distance of λ from `spectral_origin`.
@@ -67,8 +63,6 @@ class Eigenpairs(eqx.Module):
             `jit` and on accelerators). Derivatives treat `rounding` as a constant.
         kept: (k,) whether each pair belongs to the truncated spectrum; signatures ignore the other pairs. The choices
             ``multiplet="drop"`` and ``"complete"`` may exclude the last pairs; `of_part` keeps only one part's pairs.
-        part: (k,) for the boundaries "mirror" and "mean", the index of the pencil's part that each pair belongs to (0
-            is the Neumann problem); otherwise None.
         next_eigenvalue: the first eigenvalue that is not kept; infinite if it does not exist or was not computed, as
             for an interval. Derivatives treat `next_eigenvalue` as a constant.
         complete_below: the bound below which the solver certifies that it missed no eigenvalue (for an interval,
@@ -78,23 +72,27 @@ class Eigenpairs(eqx.Module):
             for an interval its lower end.
         multiplet_tolerance: the gap, relative to the distance from `spectral_origin`, below which neighbouring
             eigenvalues count as equal. If the null space is unknown, gaps at the level of rounding count as zero too.
+        part: (k,) for the boundaries "mirror" and "mean", the index of the pencil's part that each pair belongs to (0
+            is the Neumann problem); otherwise None.
+        frame: (k, n_dof) the values of `vectors`, but with a derivative that excludes rotations of eigenvectors among
+            themselves, which are singular at multiple eigenvalues. Derivatives of signatures include the effect of such
+            rotations by divided differences.
         pencil: the matrices K and M.
         solver_name: the name of the solver.
         lowest: whether the pairs are the lowest; false for an interval.
     """
 
     eigenvalues: Float[Array, " k"]
-    vectors: Float[Array, "k n_dof"]
-    frame: Float[Array, "k n_dof"]
     residuals: Float[Array, " k"]
     converged: Bool[Array, " k"]
     rounding: Float[Array, " k"]
     kept: Bool[Array, " k"]
-    part: Int[Array, " k"] | None
     next_eigenvalue: Float[Array, ""]
     complete_below: Float[Array, ""]
     spectral_origin: Float[Array, ""]
     multiplet_tolerance: Float[Array, ""]
+    part: Int[Array, " k"] | None
+    frame: Float[Array, "k n_dof"]
     pencil: AnyPencil
     solver_name: str = eqx.field(static=True)
     lowest: bool = eqx.field(static=True, default=True)
@@ -103,8 +101,22 @@ class Eigenpairs(eqx.Module):
         unknowns = sum(part.space.n_dof for part in self.pencil.parts)
         return (
             f"Eigenpairs(k={self.k} of {unknowns}, eigenvalues {describe_array(self.eigenvalues)}, "
-            f"vectors {describe_array(self.vectors)}, solver_name={self.solver_name!r})"
+            f"vectors {describe_array(self.frame)}, solver_name={self.solver_name!r})"
         )
+
+    @property
+    def vectors(self) -> Float[Array, "k n_dof"]:
+        """The coefficients of the eigenfunctions, with φᵢᵀMφⱼ = δᵢⱼ.
+
+        For the boundaries "mirror" and "mean", M is the mass of the domain doubled m times; on the domain itself, the
+        norm of each φᵢ is 1/√2ᵐ. The derivative of a vector is NaN unless its eigenvalue is simple and kept.
+        """
+        if self.pencil is None:
+            return self.frame
+        values, following = jax.lax.stop_gradient((self.eigenvalues, self.next_eigenvalue))
+        among = np.ones((self.k, self.k), bool)
+        vectors = with_rotations(self.frame, values, among, self.part, self.pencil)
+        return of_simple(vectors, values, following, self.kept, self.part, self.pencil)
 
     @property
     def eigenfunctions(self) -> Float[Array, "k *shape"]:
@@ -134,10 +146,8 @@ class Eigenpairs(eqx.Module):
         """Return the pairs on another pencil that has the same nodes but other free nodes; see `on_all_nodes`."""
         if pencil is self.pencil:
             return self
-        vectors = self.space.transfer(self.vectors, pencil.space)
-        # `frame` has the same values as `vectors`; it is transferred separately only if it may have a derivative.
-        frame = self.space.transfer(self.frame, pencil.space) if is_traced(self.frame) else vectors
-        return eqx.tree_at(lambda p: (p.vectors, p.frame, p.pencil), self, (vectors, frame, pencil))
+        frame = self.space.transfer(self.frame, pencil.space)
+        return eqx.tree_at(lambda p: (p.frame, p.pencil), self, (frame, pencil))
 
     @property
     def null_space_known(self) -> bool:

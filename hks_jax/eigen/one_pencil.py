@@ -15,11 +15,12 @@ from hks_jax.arrays import jax_array
 from hks_jax.checks import real_array, require_count
 from hks_jax.compilation import is_concrete_on_cpu, jit_quickly, numpy_where_known
 from hks_jax.eigen.adjoints.adjoint import Scalar
-from hks_jax.eigen.derivative import frame_of_chosen, solved
+from hks_jax.eigen.derivative import solved
 from hks_jax.eigen.eigenpairs import UNCERTAIN, Eigenpairs
 from hks_jax.eigen.inertia import certain_count, count_below, locate, translated
 from hks_jax.eigen.lanczos.block_lanczos import SLICE, BlockLanczos, known_by_weyl
 from hks_jax.eigen.quality import allowed_residuals, indistinct, largest, largest_of, measure_pairs, measured_on_host
+from hks_jax.eigen.rotations import with_rotations
 from hks_jax.eigen.shift_invert.matrices import balanced, near_zero
 from hks_jax.eigen.shift_invert.shift_invert import ShiftInvert, lower_bound
 from hks_jax.eigen.solver import Dense, Eigensolver, Report
@@ -97,9 +98,10 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
         origin = origin + values[0] - spread
         moved, found = solve(origin, 2 * spread, spread / number)
     if number > k:
-        values, vectors, _, _, bound = found
-        frame = frame_of_chosen(vectors[:k], pencil.mass, jnp.ones(k, bool))
-        found = values[:k], vectors[:k], frame, jax.lax.stop_gradient(values[k]), bound
+        (values, frame, _, bound), chosen = found, np.arange(number) < k
+        constant = jax.lax.stop_gradient(values + origin)
+        frame = with_rotations(frame, constant, chosen[:, None] & ~chosen, None, pencil)
+        found = values[:k], frame[:k], jax.lax.stop_gradient(values[k]), bound
     return _pairs(pencil, moved, origin, found, method)
 
 
@@ -121,10 +123,10 @@ def solve_interval(
     length, pencil = high - low, _with_balance(pencil)
     moved = translated(pencil, low, below, length / (2 * max(k / SLICE, 1)), length / max(k, 1))
     nothing = jnp.zeros((0, pencil.size), low.dtype)
-    found = jnp.zeros(0, low.dtype), nothing, nothing, jnp.asarray(jnp.inf, low.dtype), length
+    found = jnp.zeros(0, low.dtype), nothing, jnp.asarray(jnp.inf, low.dtype), length
     if k:
         found = solved(solver, moved, k, 0, True, throw, report)
-    found = *found[:4], jnp.where(held == k, jnp.minimum(found[4], length), jnp.nan)
+    found = *found[:3], jnp.where(held == k, jnp.minimum(found[3], length), jnp.nan)
     return _pairs(pencil, moved, low, found, solver, lowest=False)
 
 
@@ -185,18 +187,18 @@ def _pairs(
     lowest: bool = True,
 ) -> Eigenpairs:
     """Return the `Eigenpairs` of a pencil, given the pairs of K − σ₀M and M for an origin σ₀."""
-    values, vectors, frame, following, bound = found
+    values, frame, following, bound = found
     known = solved_pencil is pencil and pencil.null_space is not None
     if values.size:
         matrices = tabulated(SymmetricPencil(solved_pencil.stiffness, solved_pencil.mass))
-        held = jax.lax.stop_gradient((matrices, values, vectors, origin))
+        held = jax.lax.stop_gradient((matrices, values, frame, origin))
         stored = solver.in_double and _single_on_host(values, held)
         quality = _quality(*held, solved_pencil.n_null, solver.tolerance, known, stored)
     else:
         no = jnp.zeros(0, bool)
         quality = jnp.zeros(0, values.dtype), no, no, jnp.asarray(1e-6, values.dtype)
     residuals, converged, zero, tolerance = quality
-    held = jax.lax.stop_gradient((solved_pencil, vectors, values + origin, zero))
+    held = jax.lax.stop_gradient((solved_pencil, frame, values + origin, zero))
     small, rounding = _near_zero(*held, known, solver)
     # While differentiating, JAX may turn a constant array into a Python number.
     following, bound = jax_array(following), jax_array(bound)
@@ -204,18 +206,17 @@ def _pairs(
         constant = jax.lax.stop_gradient(values)
         values, following, bound = _translated(values, constant, zero, small, following, bound, origin)
     return Eigenpairs(
-        values,
-        vectors,
-        frame,
-        residuals,
-        converged,
-        rounding,
+        eigenvalues=values,
+        residuals=residuals,
+        converged=converged,
+        rounding=rounding,
         kept=jax_array(np.ones(values.size, bool)),
-        part=None,
         next_eigenvalue=following,
         complete_below=bound,
         spectral_origin=origin if known or not lowest else jax.lax.stop_gradient(values[0]),
         multiplet_tolerance=tolerance,
+        part=None,
+        frame=frame,
         pencil=pencil,
         solver_name=solver.name,
         lowest=lowest,

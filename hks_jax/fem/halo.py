@@ -2,17 +2,14 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from itertools import product
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jax.sharding import AxisType, Mesh
 from jaxtyping import Array, Float
-
-from hks_jax.traced import is_traced
 
 
 def with_rim(x: Any, periodic: tuple[bool, ...], first: int = 0) -> Any:
@@ -80,12 +77,6 @@ class Slabs:
 
     Raises:
         ValueError: a mesh with several axes.
-
-    Examples:
-        >>> slabs = hj.devices.Slabs(jax.make_mesh((1,), ("devices",)), (9, 9), (False, False))
-        >>> K, one = slabs.split(hj.assemble(field).stiffness.coefficients, 1), slabs.split(jnp.ones((9, 9, 1)))
-        >>> print(jnp.abs(slabs.product(K, one)).max().round(3))
-        0.0
     """
 
     mesh: Mesh
@@ -106,58 +97,13 @@ class Slabs:
         return -(-self.shape[0] // self.mesh.size)
 
     @property
-    def local_shape(self) -> tuple[int, ...]:
-        """The shape of one slab."""
-        return (self.thickness, *self.shape[1:])
-
-    @property
     def padded_shape(self) -> tuple[int, ...]:
         """The shape of all slabs together."""
         return (self.thickness * self.mesh.size, *self.shape[1:])
 
-    def spec(self, axis: int) -> PartitionSpec:
-        """Return the `PartitionSpec` of arrays whose dimension number ``axis`` is the first axis of the grid."""
-        return PartitionSpec(*[None] * axis, self.name)
-
-    def split(self, x: Any, axis: int = 0) -> Array:
-        """Pad an array along ``axis``, the first axis of the grid, and place one slab of the array on each device.
-
-        In a program with several processes, each process passes the whole array.
-        """
-        if is_traced(x):
-            return jax.lax.with_sharding_constraint(self._padded(x, axis), NamedSharding(self.mesh, self.spec(axis)))
-        return jax.jit(self._padded, static_argnums=1, out_shardings=NamedSharding(self.mesh, self.spec(axis)))(x, axis)
-
     def join(self, x: Array, axis: int = 0) -> Array:
-        """Remove the padding of `split`. If there was padding, every device holds the whole result."""
+        """Remove the padding of all slabs together. If there was padding, every device holds the whole result."""
         return jax.lax.slice_in_dim(x, 0, self.shape[0], axis=axis)
-
-    @partial(jax.jit, static_argnums=0)
-    def product(
-        self, coefficients: Float[Array, "offsets *padded"], x: Float[Array, "*padded b"]
-    ) -> Float[Array, "*padded b"]:
-        """Return the product of a stencil's coefficients, split along axis 1, with columns, split along axis 0.
-
-        The product is bilinear and differentiable. Each device sends and receives two planes of the columns.
-        """
-        self.check("coefficients", coefficients, 1)
-        self.check("x", x, 0)
-
-        def share(coefficients: Float[Array, "offsets *slab"], x: Float[Array, "*slab b"]) -> Float[Array, "*slab b"]:
-            if coefficients.shape[0] == 1:
-                return coefficients[0][..., None] * x
-            return product_with_rim(coefficients)(self.with_halo(x))
-
-        specs = self.spec(1), self.spec(0)
-        return jax.shard_map(share, mesh=self.mesh, in_specs=specs, out_specs=self.spec(0))(coefficients, x)
-
-    def check(self, name: str, x: Array, axis: int) -> None:
-        """Raise ValueError unless the array has the padded shape that `split` returns."""
-        got = x.shape[axis : axis + len(self.shape)]
-        if got != self.padded_shape:
-            raise ValueError(
-                f"{name}: got shape {x.shape}; expected {self.padded_shape} at axis {axis}, as Slabs.split returns it"
-            )
 
     # The methods below are called inside `shard_map`, on the slab of one device.
 
@@ -184,16 +130,11 @@ class Slabs:
 
     def own(self, x: Array, axis: int = 0) -> Array:
         """Return this device's slab of an array that every device holds as a whole."""
+        missing = self.padded_shape[0] - self.shape[0]
+        padded = jnp.pad(x, [(0, missing if a == axis else 0) for a in range(x.ndim)])
         start = jax.lax.axis_index(self.name) * self.thickness
-        return jax.lax.dynamic_slice_in_dim(self._padded(x, axis), start, self.thickness, axis=axis)
+        return jax.lax.dynamic_slice_in_dim(padded, start, self.thickness, axis=axis)
 
     def total(self, x: Any) -> Any:
         """Return the sum over all devices."""
         return jax.lax.psum(x, self.name)
-
-    def _padded(self, x: Any, axis: int) -> Array:
-        x = jnp.asarray(x)
-        if x.shape[axis : axis + len(self.shape)] != self.shape:
-            raise ValueError(f"x: got shape {x.shape}; expected the grid's {self.shape} at axis {axis}")
-        missing = self.padded_shape[0] - self.shape[0]
-        return jnp.pad(x, [(0, missing if a == axis else 0) for a in range(x.ndim)]) if missing else x

@@ -67,7 +67,7 @@ class Problem(eqx.Module):
         penalty = jnp.concatenate([jnp.zeros(0, data.dtype), *penalties])
         misfit = jnp.sum(data**2) / 2
         truncation = self.observation.truncation_misfit(pairs)
-        pairs = eqx.tree_at(lambda p: (p.vectors, p.frame, p.pencil), pairs, (None, None, None))
+        pairs = eqx.tree_at(lambda p: (p.frame, p.pencil), pairs, (None, None))
         nan = jnp.full((), jnp.nan, data.dtype)
         outcome = Outcome(misfit + jnp.sum(penalty**2) / 2, misfit, truncation, pairs, values, nan)
         return data, penalty, jax.lax.stop_gradient(outcome)

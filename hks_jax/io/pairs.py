@@ -13,7 +13,7 @@ from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.pencil import AnyPencil
 from hks_jax.storage import load_npz, write_npz
 
-ARRAYS = tuple(f.name for f in fields(Eigenpairs) if f.name not in ("frame", "pencil", "solver_name"))
+ARRAYS = "vectors", *(f.name for f in fields(Eigenpairs) if f.name not in ("frame", "pencil", "solver_name"))
 """The fields of `hks_jax.Eigenpairs` that are saved as arrays, without `frame`, which equals `vectors`."""
 _FAR = 1e-3
 """The residual, relative to the largest known eigenvalue, above which pairs count as pairs of another pencil."""
@@ -88,7 +88,8 @@ def pairs_of(name: str, arrays: Mapping[str, np.ndarray], pencil: AnyPencil) -> 
     solver_name = str(np.asarray(arrays["solver_name"]))
     values.setdefault("part", None)
     values.setdefault("rounding", jnp.zeros_like(values["eigenvalues"]))  # older files lack it
-    pairs = Eigenpairs(**values, lowest=lowest, frame=values["vectors"], pencil=pencil, solver_name=solver_name)
+    frame = values.pop("vectors")
+    pairs = Eigenpairs(**values, frame=frame, lowest=lowest, pencil=pencil, solver_name=solver_name)
     gap = np.concatenate([_residuals(pairs, number) for number in range(len(pencil.parts))])
     ends = np.array([pairs.next_eigenvalue, *pairs.eigenvalues[-1:], pairs.spectral_origin])
     size = np.max(np.abs(ends[np.isfinite(ends)]))

@@ -1,11 +1,9 @@
 """Inverses of a batch of symmetric indefinite matrices, together with their inertia."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hks_jax.linear import accelerators, lapack
@@ -22,8 +20,6 @@ _ROWS = 32
 """The largest size of blocks that are swept row by row."""
 _MANY = 128
 """Batches of at least this size usually are definite, because the spectra of small subdomains are above the shift."""
-_LARGEST, _SMALLEST = 64, 16
-"""The largest number of rows for a kernel (4 warps with 32 numbers per thread), and the smallest padded size."""
 
 
 def symmetric_inverses(matrices: Matrices, least: Pivots | None = None) -> Inverses:
@@ -36,20 +32,7 @@ def symmetric_inverses(matrices: Matrices, least: Pivots | None = None) -> Inver
     none = jnp.zeros(len(matrices), matrices.dtype) if least is None else least
     if not accelerators.at_hand():  # avoids tracing unused branches
         return (by_cholesky_factors if len(matrices) >= _MANY else by_eigenvalues)(matrices, none)
-    ways = {"cpu": by_eigenvalues} | ({"cuda": by_kernels} if _kernel_agrees(matrices.dtype) else {})
-    return jax.lax.platform_dependent(matrices, none, **ways, default=by_elimination)
-
-
-def _kernel_agrees(dtype: Any) -> bool:
-    def compare() -> list[tuple[Any, Any]]:
-        frames = np.linalg.qr(np.random.default_rng(0).standard_normal((5, 20, 20)))[0]
-        values = np.linspace(-2, 3, 20)  # none near zero
-        matrices = np.einsum("mij,j,mkj->mik", frames, values, frames).astype(dtype)
-        inverses, pivots = invert_in_registers(jnp.asarray(matrices), jnp.zeros(5, dtype))
-        negative = np.sum(np.linalg.eigvalsh(matrices) < 0, axis=1)
-        return [(inverses, np.linalg.inv(matrices)), (np.sum(np.asarray(pivots) < 0, axis=1), negative)]
-
-    return accelerators.kernels_agree("inverses", dtype, compare)
+    return jax.lax.platform_dependent(matrices, none, cpu=by_eigenvalues, default=by_elimination)
 
 
 def by_cholesky_factors(matrices: Matrices, least: Pivots) -> Inverses:
@@ -88,26 +71,10 @@ def by_eigenvalues(matrices: Matrices, least: Pivots) -> Inverses:
     return whole, jnp.concatenate([values, others], axis=1)
 
 
-def by_kernels(matrices: Matrices, least: Pivots) -> Inverses:
-    """Sweep the matrices block by block, with one kernel launch for each block."""
-    n, size = matrices.shape[1], _LARGEST
-    if n <= size:
-        return invert_in_registers(matrices, least)
-    a, pivots = matrices, []
-    # This loop runs in Python, because each iteration of an XLA loop takes three additional launches. Because of the
-    # optimisation barrier, XLA compiles one kernel for all blocks of equal size.
-    for start in range(0, n, size):
-        at, rows = jax.lax.optimization_barrier(jnp.int32(start)), min(size, n - start)
-        inverses, of_block = invert_in_registers(a, least, at, rows)
-        a = _swept(a, jax.lax.dynamic_slice_in_dim(a, at, rows, axis=1), inverses, at)
-        pivots.append(of_block)
-    return -a, jnp.concatenate(pivots, axis=1)
-
-
 def by_elimination(matrices: Matrices, least: Pivots) -> Inverses:
     """Sweep the matrices block by block, and each block row by row."""
     size = min(matrices.shape[1], _ROWS)
-    return _by_blocks(lambda blocks, least: jax.vmap(_sweep)(blocks, least[:, None]), size, matrices, least)
+    return _by_blocks(lambda blocks, least: jax.vmap(_sweep)(blocks, least), size, matrices, least)
 
 
 def _by_blocks(invert: Callable[[Array, Array], Inverses], size: int, matrices: Matrices, least: Pivots) -> Inverses:
@@ -147,62 +114,14 @@ def _away_from_zero(pivots: Float[Array, "..."], least: Float[Array, "..."]) -> 
     return jnp.where(jnp.abs(pivots) < least, jnp.where(pivots < 0, -least, least), pivots)
 
 
-# With XLA operations, each of the n pivots takes about six launches of at least 4 µs. In this kernel, one program
-# inverts one matrix, which stays in registers for all pivots.
-def invert_in_registers(
-    matrices: Matrices, least: Pivots, at: Int[Array, ""] | None = None, rows: int | None = None
-) -> tuple[Float[Array, "m s s"], Float[Array, "m s"]]:
-    """Return the inverses of blocks on the diagonal, and their pivots; see `_sweep`.
-
-    The blocks begin at row ``at`` (an int32; default 0), and have ``rows`` rows (default: all), at most `_LARGEST`.
-    """
-    from jax.experimental import pallas as pl
-    from jax.experimental.pallas import triton
-
-    m, n, _ = matrices.shape
-    rows = n if rows is None else rows
-    at = jnp.zeros((), jnp.int32) if at is None else at
-    # Triton arrays have power-of-two sizes; blocks are padded with the identity.
-    size = accelerators.padded_size(rows, _SMALLEST)
-
-    def kernel(first, matrix, least, inverse, pivots) -> None:  # type: ignore[no-untyped-def]  # references of Pallas'
-        index = jax.lax.broadcasted_iota(jnp.int32, (size,), 0)
-        within = index < rows
-        both = within[:, None] & within[None, :]
-        own = pl.ds(first[0], size)
-        a = triton.load(matrix.at[own, own], mask=both, other=0)
-        identity = (index[:, None] == index[None, :]) & ~both
-        inverted, pivots_so_far = _sweep(jnp.where(identity, 1, a), least[...])
-        triton.store(inverse.at[:, :], inverted, mask=both)
-        triton.store(pivots.at[:], pivots_so_far, mask=within)
-
-    return pl.pallas_call(
-        kernel,
-        grid=(m,),
-        in_specs=[
-            pl.BlockSpec((1,), lambda _: (0,)),
-            pl.BlockSpec((None, n, n), lambda i: (i, 0, 0)),
-            pl.BlockSpec((None, 1), lambda i: (i, 0)),
-        ],
-        out_specs=[pl.BlockSpec((None, size, size), lambda i: (i, 0, 0)), pl.BlockSpec((None, size), lambda i: (i, 0))],
-        out_shape=[
-            jax.ShapeDtypeStruct((m, rows, rows), matrices.dtype),
-            jax.ShapeDtypeStruct((m, rows), matrices.dtype),
-        ],
-        compiler_params=triton.CompilerParams(num_warps=max(size * size // 1024, 1), num_stages=1),
-        interpret=accelerators.INTERPRETED,
-        name="symmetric_inverses",
-    )(at[None], matrices, least[:, None])
-
-
-def _sweep(a: Float[Array, "n n"], least: Float[Array, " 1"]) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
+def _sweep(a: Float[Array, "n n"], least: Float[Array, ""]) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
     """Return the inverse and the pivots of one matrix. Each step sweeps the remaining row with the largest pivot."""
     n = a.shape[0]
-    index = jax.lax.broadcasted_iota(jnp.int32, (n,), 0)
+    index = jnp.arange(n)
 
     def sweep(_: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
         a, diagonal, left, pivots_so_far = state
-        chosen = index == jax.lax.argmax(jnp.where(left > 0, jnp.abs(diagonal), -1), 0, jnp.int32)
+        chosen = index == jnp.argmax(jnp.where(left > 0, jnp.abs(diagonal), -1))
         column = jnp.sum(jnp.where(chosen[None, :], a, 0), axis=1)
         pivot = _away_from_zero(jnp.sum(jnp.where(chosen, diagonal, 0), axis=0), least)
         row = jnp.where(chosen, -1, column) / pivot
@@ -211,7 +130,7 @@ def _sweep(a: Float[Array, "n n"], least: Float[Array, " 1"]) -> tuple[Float[Arr
         diagonal = jnp.where(chosen, row, diagonal - column * row)
         return a, diagonal, jnp.where(chosen, 0, left), jnp.where(chosen, pivot, pivots_so_far)
 
-    diagonal = jnp.sum(jnp.where(index[:, None] == index[None, :], a, 0), axis=1)
+    diagonal = jnp.diagonal(a)
     start = a, diagonal, jnp.ones_like(diagonal), jnp.zeros_like(diagonal)
     a, _, _, pivots_so_far = jax.lax.fori_loop(0, n, sweep, start)
     return -a, pivots_so_far

@@ -162,7 +162,7 @@ def _turned(pairs: Eigenpairs, rotation: Float[np.ndarray, "k k"], spread: Float
     mixed = jnp.asarray(spread > np.maximum(1e-6, 10 * np.asarray(pairs.residuals, np.float64)))
     residuals = jnp.where(mixed, jnp.maximum(pairs.residuals, jnp.asarray(spread, dtype)), pairs.residuals)
     return eqx.tree_at(
-        lambda p: (p.vectors, p.frame, p.residuals, p.converged),
+        lambda p: (p.frame, p.residuals, p.converged),
         pairs,
-        (matmul(q, pairs.vectors), matmul(q, pairs.frame), residuals, pairs.converged & ~mixed),
+        (matmul(q, pairs.frame), residuals, pairs.converged & ~mixed),
     )

@@ -13,19 +13,17 @@ from jaxtyping import Array, Bool, Float, Int
 from hks_jax.arrays import StaticArray, nan_outside
 from hks_jax.checks import require_static
 from hks_jax.compilation import jit_quickly
-from hks_jax.eigen.derivative import products_with_constants
 from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.rotations import changes_between
 from hks_jax.fem.nodal import on_all_nodes
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.linear_map import first_order_only
-from hks_jax.linear.products import even_size, row_blocks
+from hks_jax.linear.products import row_blocks
 from hks_jax.signatures.contractions import Applied, Columns, Contraction, Diagonal, SquaredDistances, by_numpy, shapes
 from hks_jax.signatures.filters import Custom, Derivative, Filter, mixing, weights_of
 from hks_jax.traced import is_traced
 
-_ROWS = 128
-"""The number of eigenvectors whose products with all others are computed at once, which limits the memory."""
 _SIZES = 8
 """The number of sizes for the eigenpairs of an even or odd problem of a doubled domain; each size is compiled."""
 _FILTERS = 8
@@ -84,7 +82,11 @@ def _kernel(contraction: Contraction, filters: Filter, pairs: Eigenpairs) -> Arr
     """Return the contraction of the kernels Φ f(Λ) Φᵀ of m filters."""
     # Second derivatives, for which JAX would differentiate this function and not its rule, are not supported.
     pairs = first_order_only(pairs)
-    return _weighted(contraction, _all_weights(filters, pairs.eigenvalues, pairs.kept), pairs.at_nodes)
+    return _weighted(contraction, _all_weights(filters, pairs.eigenvalues, pairs.kept), _read(pairs, pairs.frame))
+
+
+def _read(pairs: Eigenpairs, vectors: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
+    return pairs.pencil.read(vectors, pairs.part)
 
 
 @jit_quickly()
@@ -124,19 +126,19 @@ def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
         change, d_frame = _instantiated((d_pairs.pencil, d_pairs.frame))
         for number, part in enumerate(pairs.pencil.parts):
             own = pairs.of_part(number)
-            known = own.eigenvalues, own.vectors, own.kept
+            known = own.eigenvalues, own.frame, own.kept
             static = part.n_fixed > 0, len(pairs.pencil.parts), pairs.space
             reader = None if part.row_sums is None else part
             matrices = change.parts[number], reader
             terms.append(_tangent(contraction, filters, known, d_frame, _rows_of(own, number), *static, *matrices))
-    elif not _is_constant((d_pairs.eigenvalues, d_pairs.vectors)):  # the arrays themselves change, so JAX's rules apply
+    elif not _is_constant((d_pairs.eigenvalues, d_pairs.frame)):  # the arrays themselves change, so JAX's rules apply
         pairs = first_order_only(pairs)
         moved = jax.jvp(
             lambda values, vectors: _weighted(
-                contraction, _all_weights(filters, values, pairs.kept), pairs.pencil.read(vectors, pairs.part)
+                contraction, _all_weights(filters, values, pairs.kept), _read(pairs, vectors)
             ),
-            (pairs.eigenvalues, pairs.vectors),
-            _instantiated((d_pairs.eigenvalues, d_pairs.vectors)),
+            (pairs.eigenvalues, pairs.frame),
+            _instantiated((d_pairs.eigenvalues, d_pairs.frame)),
         )
         terms.append(moved[1])
     return value, reduce(operator.add, terms) if terms else jnp.zeros_like(value)
@@ -183,16 +185,7 @@ def _tangent(
     if not len(vectors):
         return jnp.zeros_like(contraction.weighted(_all_weights(filters, values, kept), vectors))
     d_frame = jnp.where(kept[:, None], d_frame, 0)  # d_frame may be NaN where pairs are not kept
-    size = even_size(len(vectors), _ROWS)
-    starts, place = row_blocks(len(vectors), size)
-
-    @jax.checkpoint  # reverse mode would otherwise store a copy of the vectors
-    def products(start: Array) -> list[Float[Array, "size k"]]:
-        own = space.transfer(jax.lax.dynamic_slice_in_dim(vectors, start, size), change.space)
-        images = (change.space.transfer(matrix.apply(own), space) for matrix in (change.stiffness, change.mass))
-        return [copies * products_with_constants(image, vectors) for image in images]
-
-    stiffness, mass = (blocks[place] for blocks in jax.lax.map(products, jnp.asarray(starts)))
+    stiffness, mass = changes_between(vectors, space, copies, change)
     weights = _all_weights(filters, values, kept)
     read, d_read = vectors, d_frame
     if reader is not None:

@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 
 import hks_jax as hj
-from hks_jax import paper
 from hks_jax.cli import demo, fit, main
 from hks_jax.cli import outputs as outputs_module
 from hks_jax.cli.options import Option, options_in
@@ -505,20 +504,6 @@ def test_demo_fits_and_draws_an_installed_brain(tmp_path, monkeypatch, capsys):
     assert inside.sum() < mask[..., 0].sum() - 60  # the rim is gone
 
 
-def test_paper_passes_its_flags_on(tmp_path, monkeypatch, capsys):
-    calls = []
-    out = tmp_path / "out"
-    monkeypatch.setattr(paper, "run", lambda *args: calls.append(args[:3]) or [out / "figure3.png"])
-    assert main(["paper", "-q", "-o", str(out), "--full", "--only", "table1", "figure3"]) == 0
-    assert main(["paper", "-q", "-o", str(out)]) == 0
-    assert capsys.readouterr().out == ""
-    assert main(["paper", "-q", "-o", str(out), "--json", "--only", "figure3"]) == 0
-    summary = json.loads(capsys.readouterr().out)
-    assert (summary["files"], summary["full"]) == ([str(out / "figure3.png")], False)
-    assert calls.pop() == (out, False, ["figure3"])
-    assert calls == [(out, True, ["table1", "figure3"]), (out, False, None)]
-
-
 # ---------------------------------------------------------------------------------------------------- what goes wrong
 
 
@@ -569,11 +554,11 @@ def test_no_command_and_help(capsys):
     captured = capsys.readouterr()
     assert captured.out == ""
     assert "find the metric that has a given signature" in captured.err  # the help, not a bare error
-    for arguments in (["--help"], ["hks", "--help"], ["demo", "--help"], ["paper", "--help"], ["--version"]):
+    for arguments in (["--help"], ["hks", "--help"], ["demo", "--help"], ["--version"]):
         assert main(arguments) == 0
     captured = capsys.readouterr()
     assert f"hks-jax {hj.__version__}" in captured.out
-    assert captured.out.count("examples:") == 4
+    assert captured.out.count("examples:") == 3
 
 
 def test_a_failed_computation_is_code_1(npz, tmp_path, capsys, monkeypatch):

@@ -170,6 +170,31 @@ def test_components_on_a_basis_in_pieces(rng, dtype, accuracy, size):
     )
 
 
+def test_a_block_becomes_orthonormal(rng):
+    """The second block has columns that are small, nearly dependent, dependent or zero; five stay independent."""
+    weights = jnp.asarray(rng.uniform(0.5, 2, 100))
+
+    def mass(x):
+        return weights[:, None] * x
+
+    x = rng.standard_normal((100, 8)) * 10.0 ** rng.uniform(-3, 3, 8)
+    y, image, factor = bases.orthonormal(mass, jnp.asarray(x))
+    np.testing.assert_allclose(y.T @ mass(y), np.eye(8), atol=1e-13)
+    np.testing.assert_allclose(image, mass(y), atol=1e-13)
+    sizes = np.abs(x).max(axis=0)
+    np.testing.assert_allclose(y @ factor.T / sizes, x / sizes, atol=1e-13)
+    x[:, 5] = x[:, 2] + 1e-13 * x[:, 5]
+    x[:, 6] = x[:, 0] - 3 * x[:, 1]
+    x[:, 7] = 0
+    y, _, factor = bases.orthonormal(mass, jnp.asarray(x))
+    values = np.linalg.eigvalsh(y.T @ mass(y))
+    assert values[0] > -1e-13
+    assert values[-1] < 1 + 1e-6
+    np.testing.assert_allclose(values[-5:], 1, atol=1e-6)
+    sizes = np.abs(x).max(axis=0).clip(1e-9)
+    np.testing.assert_allclose(y @ factor.T / sizes, x / sizes, atol=1e-6)
+
+
 def test_eigenvalues_found_beyond_those_wanted_are_forgotten():
     plan = Plan(wanted=5, block=2, slice_size=5, max_slices=9, tolerance=1e-8, nulls=1)
     values = jnp.asarray(np.random.default_rng(0).permutation(plan.capacity).astype(float))

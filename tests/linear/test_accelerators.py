@@ -10,11 +10,9 @@ from fields import random_spd
 from scipy.spatial import ConvexHull
 
 import hks_jax as hj
-from hks_jax.eigen.lanczos import krylov_basis
 from hks_jax.fem.stencil import Stencil
-from hks_jax.linear import accelerators, column_kernels, dissection, symmetric_inverse
+from hks_jax.linear import accelerators, dissection
 from hks_jax.linear.chebyshev import chebyshev_iteration
-from hks_jax.linear.column_kernels import orthonormal, parts_of_products, remainder
 from hks_jax.linear.dissection import dissect
 from hks_jax.linear.multifrontal import factorise
 
@@ -83,11 +81,6 @@ def test_refined_solves_are_those_of_cpus(rng, monkeypatch):
     np.testing.assert_allclose(*values, atol=1e-6 * values[0][1])
 
 
-@pytest.fixture
-def interpreted(monkeypatch):
-    monkeypatch.setattr(accelerators, "INTERPRETED", True)
-
-
 def pencil_of(rng, domain):
     if domain == "mesh":
         points = rng.standard_normal((300, 3))
@@ -114,96 +107,3 @@ def test_merged_levels_solve_as_the_tree_does(rng, monkeypatch, domain, traffic)
     exact = np.linalg.solve(pencil.stiffness.to_dense() - 40 * pencil.mass.to_dense(), rhs)
     for factor in (plain, several):
         np.testing.assert_allclose(factor.solve(rhs), exact, atol=1e-10 * np.abs(exact).max())
-
-
-@pytest.mark.parametrize(
-    ("n", "b", "dtype"),
-    [
-        (1, 1, float),
-        (300, 8, np.float32),
-        *(pytest.param(*c, float, marks=pytest.mark.slow) for c in [(1100, 8), (70, 20)]),
-    ],
-)
-def test_kernels_of_columns(rng, interpreted, n, b, dtype):
-    x, y, z = (jnp.asarray(rng.standard_normal((n, b)).astype(dtype)) for _ in range(3))
-    mix, tolerance = jnp.asarray(rng.standard_normal((b, b)).astype(dtype)), 1e4 * np.finfo(dtype).eps
-    parts = parts_of_products(y, x)
-    products = np.asarray(y).T @ np.asarray(x)
-    np.testing.assert_allclose(jnp.sum(parts, axis=0), products, atol=tolerance)
-    rest, total = remainder(x, y, parts)
-    np.testing.assert_allclose(total, products, atol=tolerance)
-    np.testing.assert_allclose(rest, x - y @ products, rtol=tolerance, atol=n * tolerance)
-    rest, total = remainder(x, y, parts, (z, mix))
-    np.testing.assert_allclose(total, (products + products.T) / 2, atol=tolerance)
-    np.testing.assert_allclose(rest, x - y @ total - z @ mix, rtol=tolerance, atol=n * tolerance)
-
-
-@pytest.mark.slow
-def test_the_recurrence_by_kernels_is_the_plain_one(rng, interpreted, monkeypatch):
-    pencil = pencil_of(rng, "mask")
-    mass = pencil.mass.of_columns()
-    x, before = (jnp.asarray(rng.standard_normal((pencil.size, 4))) for _ in range(2))
-    block, image, factor = krylov_basis.orthonormal(mass, before)
-    plain = krylov_basis.recur(block, image, before, factor, x), krylov_basis.without(block, image, x)
-    monkeypatch.setattr(krylov_basis, "_one_of", lambda by_kernels, plain, x: by_kernels())
-    by_kernels = krylov_basis.recur(block, image, before, factor, x), krylov_basis.without(block, image, x)
-    for one, other in zip(jax.tree.leaves(plain), jax.tree.leaves(by_kernels), strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-12)
-    y, image, factor = krylov_basis.orthonormal(mass, before)
-    np.testing.assert_allclose(y.T @ mass(y), np.eye(4), atol=1e-14)
-    np.testing.assert_allclose(image, mass(y), atol=1e-14)
-    np.testing.assert_allclose(y @ factor.T, before, atol=1e-13)
-
-
-def factor_by_kernel(products):
-    """Return F with FFᵀ = G, and F⁻ᵀ."""
-    identity = jnp.eye(len(products), dtype=products.dtype)
-    (change,), factor = orthonormal(jnp.asarray(products)[None], (identity,), identity)
-    return np.asarray(factor), np.asarray(change)
-
-
-@pytest.mark.parametrize(("b", "dtype"), [(1, float), (8, float), (8, np.float32), (20, float)])
-def test_factor_of_a_gram_matrix(rng, interpreted, b, dtype):
-    x = (rng.standard_normal((100, b)) * 10.0 ** rng.uniform(-3, 3, b)).astype(dtype)
-    products = x.T @ x
-    factor, change = factor_by_kernel(products)
-    norms, eps = np.sqrt(np.diag(products)), np.finfo(dtype).eps
-    np.testing.assert_allclose(
-        factor @ factor.T / norms / norms[:, None], products / norms / norms[:, None], atol=50 * eps
-    )
-    np.testing.assert_allclose((x @ change).T @ (x @ change), np.eye(b), atol=1e4 * eps)
-    np.testing.assert_allclose(factor.T @ change, np.eye(b), atol=1e3 * eps)
-
-
-def test_dependent_columns_become_orthonormal_in_two_passes(rng, interpreted):
-    x = rng.standard_normal((100, 8))
-    x[:, 5] = x[:, 2] + 1e-13 * x[:, 5]
-    x[:, 6] = x[:, 0] - 3 * x[:, 1]
-    x[:, 7] = 0
-    for _ in range(2):
-        x = x @ factor_by_kernel(x.T @ x)[1]
-    products = x.T @ x
-    assert np.isfinite(x).all()
-    np.testing.assert_allclose(products[:5, :5], np.eye(5), atol=1e-8)
-    assert np.abs(products).max() < 10
-
-
-@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
-def test_kernels_prove_themselves_at_the_first_use(dtype, interpreted, monkeypatch):
-    if accelerators.at_hand():
-        pytest.skip("the kernels compile here: this test needs a device on which they do not")
-    monkeypatch.setattr(accelerators, "_PROVED", {})
-    assert not column_kernels.agree(dtype)  # no GPU here, and nothing to prove
-    monkeypatch.setattr(accelerators, "kernels_compile", lambda: True)
-    assert jax.jit(lambda: jnp.asarray(column_kernels.agree(dtype)))()  # while a program is traced
-    assert symmetric_inverse._kernel_agrees(dtype)
-    right = column_kernels.parts_of_products
-    monkeypatch.setattr(column_kernels, "parts_of_products", lambda x, y: 1.01 * right(x, y))
-    assert column_kernels.agree(dtype)  # once in a process
-    accelerators._PROVED.clear()
-    with pytest.warns(RuntimeWarning, match=r"on cpu the kernels of block Lanczos in float\d\d have a relative error"):
-        assert not column_kernels.agree(dtype)
-    assert not column_kernels.agree(dtype)  # told once
-    monkeypatch.setattr(accelerators, "INTERPRETED", False)
-    with pytest.warns(RuntimeWarning, match=r"kernels of inverses in float\d\d do not compile \("):
-        assert not symmetric_inverse._kernel_agrees(dtype)  # Pallas compiles nothing for a CPU

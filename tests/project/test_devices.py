@@ -43,16 +43,9 @@ def found():
 
 
 @pytest.mark.slow
-def test_stencil_products_and_their_derivatives_on_slabs(found):
+def test_stencil_products_on_slabs(found):
     assert found["devices"] == 8
-    assert [len(errors) for errors in found["halo"]] == [1, 3, 1]
-    assert max(error for errors in found["halo"] for error in errors.values()) < 1e-15
-
-
-@pytest.mark.slow
-def test_heat_on_slabs_is_the_exponential(found):
-    assert found["heat"]["against expm"] < 1e-12
-    assert found["heat"]["derivative"] < 1e-13
+    assert max(found["halo"]) < 1e-15
 
 
 @pytest.mark.slow
@@ -81,9 +74,7 @@ def test_eigenpairs_on_eight_devices(found):
 @pytest.mark.slow
 def test_refusals_say_what_was_expected(found):
     for message, expected in zip(
-        found["refusals"],
-        ["one axis", "one axis", "expected arrays of the same length", "Slabs.split returns it", "the grid's (9, 4)"],
-        strict=True,
+        found["refusals"], ["one axis", "expected arrays of the same length", "one axis"], strict=True
     ):
         assert expected in message
 
@@ -95,7 +86,7 @@ def on_two_processes(mode):
     both = finish([start(mode, index, port, devices=1) for index in range(2)], timeout=500)
     for found in both:
         assert (found["processes"], found["devices"]) == (2, 2)
-        assert found["halo"][0]["product"] < 1e-15
+        assert found["halo"][0] < 1e-15
     return both
 
 

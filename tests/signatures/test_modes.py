@@ -389,7 +389,7 @@ def rotated(pairs, rng):
     for label in np.unique(labels):
         own = np.flatnonzero(labels == label)
         q[np.ix_(own, own)] = np.linalg.qr(rng.standard_normal((len(own), len(own))))[0]
-    moved = eqx.tree_at(lambda p: (p.vectors, p.frame), pairs, (q @ pairs.vectors, q @ pairs.frame))
+    moved = eqx.tree_at(lambda p: p.frame, pairs, q @ pairs.frame)
     return moved, q
 
 

@@ -1,15 +1,14 @@
-"""A growing M-orthonormal Krylov basis, and operations on its blocks, by XLA's operations or by CUDA kernels."""
+"""A growing M-orthonormal Krylov basis, and operations on its blocks."""
 
-from collections.abc import Callable
 from itertools import accumulate
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hks_jax.linear import accelerators, column_kernels, lapack
+from hks_jax.linear import accelerators, lapack
 from hks_jax.linear.operators import OfColumns
 from hks_jax.linear.products import gram, matmul, products_with_columns
 
@@ -132,60 +131,29 @@ def _put(
 
 def recur(block: Block, image: Block, before: Block, coupling: Small, x: Block) -> tuple[Block, Small]:
     """Orthogonalise x = (K − σM)⁻¹M · block against the block and the previous block; also return blockᵀMx."""
-
-    def plain() -> tuple[Array, Array]:
-        diagonal = gram(image, x)
-        diagonal = (diagonal + diagonal.T) / 2
-        return x - matmul(block, diagonal) - matmul(before, coupling), diagonal
-
-    def by_kernels() -> tuple[Array, Array]:
-        parts = column_kernels.parts_of_products(image, x)
-        return column_kernels.remainder(x, block, parts, (before, coupling))
-
-    return _one_of(by_kernels, plain, x)
+    diagonal = gram(image, x)
+    diagonal = (diagonal + diagonal.T) / 2
+    return x - matmul(block, diagonal) - matmul(before, coupling), diagonal
 
 
 def without(block: Block, image: Block, x: Block) -> Block:
     """Orthogonalise x against the M-orthonormal columns of a block, whose image under M is given."""
-
-    def by_kernels() -> Array:
-        return column_kernels.remainder(x, block, column_kernels.parts_of_products(image, x))[0]
-
-    return _one_of(by_kernels, lambda: x - matmul(block, gram(image, x)), x)
+    return x - matmul(block, gram(image, x))
 
 
 def orthonormal(mass: OfColumns, x: Block) -> tuple[Block, Block, Small]:
     """Return M-orthonormal columns y, My, and the factor R of x = yRᵀ.
 
-    XLA's operations factorise the Gram matrix by its eigenvalues; CUDA kernels use a pivoted Cholesky factorisation,
-    which is faster on GPUs. In both factorisations, divisors have a lower bound, so that no entry becomes infinite.
+    The Gram matrix is factorised twice by its eigenvalues. Divisors have a lower bound, so that no entry becomes
+    infinite.
     """
-    identity = jnp.asarray(np.eye(x.shape[1], dtype=x.dtype))  # a constant, so that no kernel computes it
-
-    def plain() -> tuple[Array, Array, Array]:
-        y, total = x, identity
-        for _ in range(2):
-            image = mass(y)
-            factor, change = _factored(gram(y, image))
-            y = matmul(y, change)
-            total = matmul(total, factor)
-        return y, matmul(image, change), total
-
-    def by_kernels() -> tuple[Array, Array, Array]:
-        parts = column_kernels.parts_of_products(x, mass(x))
-        (y,), total = column_kernels.orthonormal(parts, (x,), identity)
+    y, total = x, jnp.asarray(np.eye(x.shape[1], dtype=x.dtype))  # a constant, so that nothing computes it
+    for _ in range(2):
         image = mass(y)
-        parts = column_kernels.parts_of_products(y, image)
-        (y, image), total = column_kernels.orthonormal(parts, (y, image), total)
-        return y, image, total
-
-    return _one_of(by_kernels, plain, x)
-
-
-def _one_of(by_kernels: Callable[[], Any], plain: Callable[[], Any], x: Block) -> Any:
-    if x.shape[1] <= column_kernels.LARGEST and column_kernels.agree(x.dtype):
-        return jax.lax.platform_dependent(cuda=by_kernels, default=plain)
-    return plain()
+        factor, change = _factored(gram(y, image))
+        y = matmul(y, change)
+        total = matmul(total, factor)
+    return y, matmul(image, change), total
 
 
 def _factored(products: Small) -> tuple[Small, Small]:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from figures import INDICES
 from jaxtyping import Float, Int
 
 from hks_jax.domain.components import active_elements
@@ -14,7 +15,6 @@ from hks_jax.domain.examples import bumpy_torus_field, degenerate_point_field, f
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_checks import MetricChoice
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.paper.figures import INDICES
 
 QUICK, FULL = ((51,), (50, 100)), ((201,), (50, 100, 200, 400))  # nodes per axis of the figures' fields and torus
 COARSE = 11

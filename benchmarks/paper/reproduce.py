@@ -1,18 +1,23 @@
 """A reproduction of the paper: Table 1, Figures 1 to 6, and its remark on the triangle inequality.
 
+    python benchmarks/paper/reproduce.py [--full] [--only table1 figure3 ...] [-o FOLDER]
+
 V. Zobel, J. Reininghaus, I. Hotz: “Visualization of Two-Dimensional Symmetric Positive Definite Tensor Fields Using the
 Heat Kernel Signature”, Topological Methods in Data Analysis and Visualization III, 2014.
 """
 
+import argparse
 import time
 from collections.abc import Callable
 from pathlib import Path
 
+import figures
+import jax
+import table1
+import triangles
 from matplotlib.figure import Figure
 
 from hks_jax import plot
-from hks_jax.paper import figures, table1, triangles
-from hks_jax.storage import atomic_path
 
 Echo = Callable[[str], None]
 
@@ -29,23 +34,8 @@ ITEMS: dict[str, Callable[[bool, Echo], Figure | dict[str, str]]] = {
 """The function that makes each table or figure; it returns a figure, or a dictionary from file names to texts."""
 
 
-def run(output: Path, full: bool = False, only: list[str] | None = None, echo: Echo = print) -> list[Path]:
-    """Write the paper's table and figures, and counts of violated triangle inequalities; return the files' paths.
-
-    Args:
-        output: the directory, which is created if necessary.
-        full: whether to use the paper's sizes (many minutes) instead of small sizes (a minute or two).
-        only: a selection of ``"table1"``, ``"figure1"`` … ``"figure6"``, ``"triangles"``; by default all.
-        echo: a function that receives progress messages, each a line of text.
-
-    Raises:
-        ValueError: if a name in `only` is unknown.
-    """
-    names = list(ITEMS) if only is None else list(only)
-    unknown = [name for name in names if name not in ITEMS]
-    if unknown:
-        raise ValueError(f"only: got {', '.join(map(repr, unknown))}; expected names from {', '.join(ITEMS)}")
-    output = Path(output)
+def run(output: Path, full: bool, names: list[str], echo: Echo = print) -> list[Path]:
+    """Write tables and figures of these names into a folder, which is created if necessary; return the files' paths."""
     output.mkdir(parents=True, exist_ok=True)
     written = []
     for number, name in enumerate(names, 1):
@@ -60,9 +50,23 @@ def run(output: Path, full: bool = False, only: list[str] | None = None, echo: E
             plot.save_figure(made, paths[0])
         else:
             for path, text in zip(paths, made.values(), strict=True):
-                with atomic_path(path) as temporary:
-                    temporary.write_text(text, encoding="utf-8")
+                path.write_text(text, encoding="utf-8")
         seconds = time.perf_counter() - start
         say(f"{', '.join(str(path) for path in paths)} ({seconds:.0f} s)")
         written += paths
     return written
+
+
+def main() -> None:
+    """Read the command line, and write tables and figures."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--full", action="store_true", help="the paper's sizes, which take minutes instead of seconds")
+    parser.add_argument("--only", nargs="+", choices=ITEMS, default=list(ITEMS), metavar="NAME", help=", ".join(ITEMS))
+    parser.add_argument("-o", "--output", type=Path, default=Path("paper"), metavar="FOLDER")
+    arguments = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    run(arguments.output, arguments.full, arguments.only)
+
+
+if __name__ == "__main__":
+    main()

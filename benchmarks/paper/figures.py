@@ -11,6 +11,8 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 from matplotlib.patches import ConnectionPatch, Rectangle
 from scipy.ndimage import distance_transform_edt
+from signature import continued_signature, enough_pairs, flat_signature, signature
+from table1 import interpolate_periodic
 
 from hks_jax import plot
 from hks_jax.curvature import hks_expansion
@@ -27,8 +29,6 @@ from hks_jax.domain.tensor_checks import MetricChoice
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.boundary import crop, reflect
 from hks_jax.io import TensorVolume, erode, find_example_brain, fit_dwi
-from hks_jax.paper.signature import continued_signature, enough_pairs, flat_signature, signature
-from hks_jax.paper.table1 import interpolate_periodic
 from hks_jax.plot.signature import bounding_box, placed
 
 SIZES: dict[str, tuple] = {
