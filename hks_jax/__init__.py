@@ -59,6 +59,8 @@ from hks_jax.linear.dense_eigh import eigh as eigh
 from hks_jax.linear.factorised_matrix import FactorisedMatrix as FactorisedMatrix
 from hks_jax.linear.matrix_function import matrix_function as matrix_function
 from hks_jax.linear.pencil import SymmetricPencil as SymmetricPencil
+from hks_jax.signatures.alignment import Alignment as Alignment
+from hks_jax.signatures.alignment import align as align
 from hks_jax.signatures.distances import biharmonic_distance as biharmonic_distance
 from hks_jax.signatures.distances import diffusion_distance as diffusion_distance
 from hks_jax.signatures.distances import global_point_signature as global_point_signature
@@ -78,10 +80,16 @@ from hks_jax.signatures.kernels import wks as wks
 from hks_jax.signatures.log_determinant import LogDeterminant as LogDeterminant
 from hks_jax.signatures.log_determinant import heat_coefficients as heat_coefficients
 from hks_jax.signatures.log_determinant import log_determinant as log_determinant
+from hks_jax.signatures.modes import ModeEnergies as ModeEnergies
+from hks_jax.signatures.modes import decompose as decompose
+from hks_jax.signatures.modes import energy as energy
+from hks_jax.signatures.modes import reconstruct as reconstruct
+from hks_jax.signatures.modes import spectral_filter as spectral_filter
 from hks_jax.signatures.regions import RegionStatistics as RegionStatistics
 from hks_jax.signatures.regions import region_statistics as region_statistics
 from hks_jax.signatures.rim import boundary_influence as boundary_influence
 from hks_jax.signatures.spans import default_times as default_times
+from hks_jax.signatures.surrogates import surrogates as surrogates
 from hks_jax.signatures.times import default_energies as default_energies
 from hks_jax.signatures.truncation import Truncation as Truncation
 from hks_jax.signatures.truncation import truncation as truncation
@@ -89,6 +97,7 @@ from hks_jax.signatures.truncation import truncation_map as truncation_map
 from hks_jax.spectrum_free.colouring import Colouring as Colouring
 from hks_jax.spectrum_free.heat_diagonal import colouring as colouring
 from hks_jax.spectrum_free.heat_diagonal import hks_spectrum_free as hks_spectrum_free
+from hks_jax.spectrum_free.smoothing import smooth as smooth
 from hks_jax.uncertainty import TensorNoise as TensorNoise
 from hks_jax.uncertainty import Uncertainty as Uncertainty
 from hks_jax.uncertainty import smooth_tensors as smooth_tensors

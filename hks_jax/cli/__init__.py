@@ -4,6 +4,7 @@ examples:
   hks-jax demo
   hks-jax info tensor.nii.gz
   hks-jax hks tensor.nii.gz -o out --mask mask.nii.gz --slice z=14 --metric inverse
+  hks-jax modes tensor.nii.gz -o out --operator fick --map bold.nii.gz
   hks-jax batch subjects.tsv -o study --metric inverse --atlas atlas.nii.gz
   hks-jax hks --help
 """
@@ -24,14 +25,14 @@ import numpy as np
 
 from hks_jax import __version__
 from hks_jax.cache import keep_compiled
-from hks_jax.cli import convert, curvature, demo, explore, fit, hks, info, plot, spectrum, stats
+from hks_jax.cli import convert, curvature, demo, explore, fit, hks, info, modes, plot, smooth, spectrum, stats
 from hks_jax.cli.inputs import require_inputs_kept
 from hks_jax.cli.options import SPELLED, add_command, as_options
 from hks_jax.cli.outputs import show
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.study import batch
 
-COMMANDS = (hks, spectrum, curvature, fit, batch, stats, plot, explore, info, convert, demo)
+COMMANDS = (hks, modes, smooth, spectrum, curvature, fit, batch, stats, plot, explore, info, convert, demo)
 """A module for each command: its docstring is the help text, `OPTIONS` lists its options, and `run` runs it.
 
 The function `writes` of commands with input files returns the files that the command may write.

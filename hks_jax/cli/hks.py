@@ -39,6 +39,7 @@ from hks_jax.cli.options import READING, SOLVING, options_in, refuse
 from hks_jax.cli.outputs import PAIRS, REPORT, Done, of_earlier, write_outputs
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read, read_volume, require_metric, require_one
+from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.fem.assembly import MESH_BOUNDARIES
 from hks_jax.io import read_mask, read_mesh, sample_tensors
 from hks_jax.io.formats import format_of
@@ -48,11 +49,7 @@ from hks_jax.io.result import Result
 from hks_jax.io.tensor_order import matrices
 from hks_jax.optional import optional
 
-OPTIONS = f"""
-@file @metric {READING} @output {SOLVING}
---through I,J,K
-    voxel through which the slices in the picture of a volume pass, or else the nearest voxel in the domain (default: a
-    voxel in the middle)
+OF_MESHES = """\
 @clean
 --tensors FILE
     tensors of a volume that contains the mesh (a cortical surface, for example). The tensors are interpolated at the
@@ -60,7 +57,15 @@ OPTIONS = f"""
     options on voxels and on the meaning of numbers refer to this file
 --inside FILE
     vertices of a mesh that form the domain, such as a cortical surface without its medial wall: FreeSurfer's .label, or
-    zeros and ones in .npy or in the array 'mask' of an .npz
+    zeros and ones in .npy or in the array 'mask' of an .npz"""
+"""The options of meshes."""
+
+OPTIONS = f"""
+@file @metric {READING} @output {SOLVING}
+--through I,J,K
+    voxel through which the slices in the picture of a volume pass, or else the nearest voxel in the domain (default: a
+    voxel in the middle)
+{OF_MESHES}
 @signature @noise @view @rim
 --save-pairs  write the eigenpairs to OUT/pairs.npz; 'hks-jax hks OUT/pairs.npz --times …' reuses them
 """
@@ -118,9 +123,9 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
 
 
 def _on_mesh(args: argparse.Namespace, settings: Settings, progress: Progress) -> Done:
-    _check_mesh_options(args)
+    check_mesh_options(args)
     with progress.stage("reading", str(args.file)):
-        mesh, noisy = _read_domain(args, progress)
+        mesh, noisy = read_domain(args, progress)
     boundary = settings.boundary or "neumann"
     settings = replace(settings, boundary=boundary)
     with progress.stage("assembly", f"{len(mesh.vertices)} vertices"):
@@ -132,13 +137,17 @@ def _on_mesh(args: argparse.Namespace, settings: Settings, progress: Progress) -
         result = of_pairs(settings, progress)
     else:
         result = with_error_bars(args, of_pairs, noisy, pairs, settings, progress)
-    image = args.file.suffix.lower()
-    if image not in WRITTEN or (image == ".ply" and isinstance(mesh, TetMesh)):  # formats without values at vertices
-        image = ".vtu"
-    return write_outputs(args.output, result, progress, partial(_draw_mesh, result, args.show_rim), image)
+    drawing = partial(_draw_mesh, result, args.show_rim)
+    return write_outputs(args.output, result, progress, drawing, image_of_mesh(args.file, mesh))
 
 
-def _check_mesh_options(args: argparse.Namespace) -> None:
+def image_of_mesh(file: Path, mesh: SimplicialMesh) -> str:
+    """Return the suffix of results on a mesh: that of its file, or .vtu if its format has no values at vertices."""
+    suffix = file.suffix.lower()
+    return ".vtu" if suffix not in WRITTEN or (suffix == ".ply" and isinstance(mesh, TetMesh)) else suffix
+
+
+def check_mesh_options(args: argparse.Namespace) -> None:
     """Raise ValueError for options that only grids have, and for tensors without --metric."""
     if args.others:
         raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one mesh")
@@ -162,7 +171,7 @@ def _check_mesh_options(args: argparse.Namespace) -> None:
     require_one(args)
 
 
-def _read_domain(args: argparse.Namespace, progress: Progress) -> tuple[SurfaceMesh | TetMesh, Noisy | None]:
+def read_domain(args: argparse.Namespace, progress: Progress) -> tuple[SurfaceMesh | TetMesh, Noisy | None]:
     """Read the mesh in the chosen precision, with the metric of its tensors if there are any.
 
     For error bars, also return the tensors and their noise, at the voxels if the tensors come from a volume.

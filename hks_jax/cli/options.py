@@ -273,7 +273,7 @@ def as_options(message: str, names: Iterable[str] = SPELLED) -> str:
         argument = rf"\b([Pp]ass|[Cc]hoose|or|try) {name}\b(?! [a-z])(?: \({flag(name)}\))?"
         message = re.sub(rf'{argument}(?: |=|: )"([\w/-]+)"', rf"\1 {flag(name)} \2", message)
         message = re.sub(argument, rf"\1 {flag(name)}", message)
-    for name, option in (("iterations", "--erode"), ("level", "--noise")):
+    for name, option in (("iterations", "--erode"), ("level", "--noise"), ("f", "--map"), ("fwhm", "--fwhm")):
         message = re.sub(rf"^{name}: ", f"{option}: ", message)
     for words, options in _REMEDIES.items():
         message = message.replace(words, options)

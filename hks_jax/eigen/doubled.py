@@ -84,7 +84,7 @@ def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: i
     lowest, ends = order[:k], np.cumsum(sizes)[:-1]
     chosen = jnp.split(jnp.zeros(values.size, bool).at[lowest].set(True), ends)
     frames = [  # a chosen vector also rotates towards computed vectors that are not chosen
-        with_rotations(p.frame, jax.lax.stop_gradient(p.eigenvalues), c[:, None] & ~c, None, p.pencil)
+        with_rotations(p.frame, jax.lax.stop_gradient(p.eigenvalues), c[:, None] & ~c[None], None, p.pencil)
         for p, c in zip(solved, chosen, strict=True)
     ]
 

@@ -178,6 +178,11 @@ class Eigenpairs(eqx.Module):
         return _cut_multiplet(self._spectrum, self.kept) if self.k else jnp.zeros((), int)
 
     @property
+    def multiplets(self) -> Int[Array, " k"]:
+        """The number of the multiple eigenvalue that each eigenvalue belongs to, from 0, as `cut_multiplet` tells."""
+        return _multiplets(self._spectrum) if self.k else jnp.zeros(0, int)
+
+    @property
     def _spectrum(self) -> "_Spectrum":
         # A known null space makes the lowest eigenvalues exact, and the distance of the others from zero is accurate.
         parts = () if self.pencil is None else self.pencil.parts
@@ -352,6 +357,12 @@ def _cut_multiplet(xp: Any, spectrum: _Spectrum, kept: Any) -> Any:
     beyond = xp.append(spectrum.values, spectrum.following)[count]
     whole = ends[count - 1] | xp.isnan(beyond - spectrum.values[count - 1])  # pairs that were not found are NaN
     return xp.where(whole, 0, count - xp.max(xp.where(ends & (index < count), index + 1, 0)))
+
+
+@numpy_where_known()
+def _multiplets(xp: Any, spectrum: _Spectrum) -> Any:
+    ends = _ends_of_multiplets(xp, spectrum).astype(xp.int32)
+    return xp.cumsum(ends, dtype=xp.int32) - ends
 
 
 def _ends_of_multiplets(xp: Any, spectrum: _Spectrum) -> Any:

@@ -100,7 +100,7 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
     if number > k:
         (values, frame, _, bound), chosen = found, np.arange(number) < k
         constant = jax.lax.stop_gradient(values + origin)
-        frame = with_rotations(frame, constant, chosen[:, None] & ~chosen, None, pencil)
+        frame = with_rotations(frame, constant, chosen[:, None] & ~chosen[None], None, pencil)
         found = values[:k], frame[:k], jax.lax.stop_gradient(values[k]), bound
     return _pairs(pencil, moved, origin, found, method)
 

@@ -85,7 +85,7 @@ class Pencil(SymmetricPencil):
         """Return weights w for nodal ``values`` of a function u: w·φ = ∫φu for all nodal values φ from `read`."""
         if self.row_sums is None:
             return self.mass.apply(values)
-        return jnp.where(jnp.isinf(self.row_sums), 0, self.row_sums) * values
+        return jnp.broadcast_to(jnp.where(jnp.isinf(self.row_sums), 0, self.row_sums), values.shape) * values
 
     def with_stiffness(self, stiffness: PatternedOperator) -> "Pencil":
         """Return the pencil with another stiffness, such as K + V, on the same domain; the null space is then unknown.
@@ -117,7 +117,7 @@ class Pencil(SymmetricPencil):
 @jax.jit
 def _read(mass: Operator, row_sums: Float[Array, " n_dof"], functions: Float[Array, "... n_dof"]) -> Array:
     columns = functions.reshape(-1, mass.size).T
-    return (functions + mass.of_columns()(columns).T.reshape(functions.shape) / row_sums) / 2
+    return ((columns + mass.of_columns()(columns) / row_sums[:, None]) / 2).T.reshape(functions.shape)
 
 
 class MirrorPencil(eqx.Module):

@@ -24,6 +24,24 @@ class SampledMetric(eqx.Module):
     fick: bool = eqx.field(static=True, default=False)  # whether the operator is Fick's, with D = T⁻¹
 
 
+def mean_diffusivity(metric: SampledMetric | None, space: FunctionSpace, dtype: Any) -> Float[Array, ""]:
+    """Return the mean of trace(T⁻¹)/d over the nodes of a grid with the metric T, or 1 on a mesh or without a metric.
+
+    A plane wave with the wave number ξ has about the eigenvalue of this number times |ξ|².
+    """
+    if metric is None or not isinstance(space, GridSpace):
+        return jnp.ones((), dtype)
+    return _mean_of(jax.lax.stop_gradient(metric.tensors), mask_for(metric.tensors, space.domain)).astype(dtype)
+
+
+@numpy_where_known()
+def _mean_of(xp: Any, tensors: Any, domain: Any) -> Any:
+    d = tensors.shape[-1]
+    inverse = spd.inverse(xp.where(domain[..., None, None], tensors, xp.eye(d, dtype=tensors.dtype)))
+    mean = sum(inverse[..., a, a] for a in range(d)) / d
+    return xp.sum(xp.where(domain, mean, 0)) / xp.sum(domain, dtype=tensors.dtype)
+
+
 class Resolution(eqx.Module):
     """The effect of the spacing on signatures to leading order (see `truncation`); derivatives treat it as constant."""
 

@@ -6,6 +6,7 @@ from hks_jax.io.dwi import fit_dwi as fit_dwi
 from hks_jax.io.files import read_tensors as read_tensors
 from hks_jax.io.files import save as save
 from hks_jax.io.files import save_tensors as save_tensors
+from hks_jax.io.maps import read_maps as read_maps
 from hks_jax.io.masks import erode as erode
 from hks_jax.io.masks import read_mask as read_mask
 from hks_jax.io.mesh import read_mesh as read_mesh

@@ -39,7 +39,7 @@ def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) ->
         36
     """
     name = os.fspath(path)
-    values, place = _image(name, affine, IMAGES)
+    values, place = image_of(name, affine, IMAGES)
     require_position(name, place, affine, values.shape)
     return mask_in_file(name, values)
 
@@ -85,12 +85,12 @@ def read_labels(path: str | os.PathLike[str], on: TensorVolume | SimplicialMesh)
     """
     shape, affine = (on.shape, on.affine) if isinstance(on, TensorVolume) else ((len(on.vertices),), None)
     name = os.fspath(path)
-    values, place = _image(name, affine, tuple(suffix for suffix in IMAGES if suffix != ".npz"))
+    values, place = image_of(name, affine, tuple(suffix for suffix in IMAGES if suffix != ".npz"))
     if isinstance(on, TensorVolume) and affine is not None and place is not None and values.ndim in (2, 3):
         if values.ndim == 2:  # the file's two axes are the axes of the slice
             values = np.expand_dims(values, on.thin_axis)
             place = np.insert(np.delete(place, 2, axis=1), on.thin_axis, place[:, 2], axis=1)
-        values = _at_voxels(name, values, np.linalg.solve(place, affine), on)
+        values = at_voxels(name, values, np.linalg.solve(place, affine), on)
     if values.shape != shape:
         raise ValueError(f"{name}: got labels of shape {values.shape}; expected the shape of the image, {shape}")
     if not np.isfinite(values).all() or not np.array_equal(values, np.rint(values)):
@@ -124,8 +124,8 @@ def names_beside(path: str | os.PathLike[str]) -> str | None:
     return str(table) if table.is_file() else None
 
 
-def _image(name: str, affine: np.ndarray | None, suffixes: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the values of a mask or label map without trailing axes of length one, and its affine or None."""
+def image_of(name: str, affine: np.ndarray | None, suffixes: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return the values of an image without trailing axes of length one, and its affine or None."""
     read = format_of(name, suffixes).read_image
     assert read is not None
     values, place, unit = read(name)
@@ -138,21 +138,23 @@ def _image(name: str, affine: np.ndarray | None, suffixes: tuple[str, ...]) -> t
     return values, place
 
 
-def _at_voxels(name: str, values: np.ndarray, to_labels: np.ndarray, volume: TensorVolume) -> np.ndarray:
-    """Return the labels at an image's voxels; raise ValueError if labels and image are not on the same voxels."""
+def at_voxels(
+    name: str, values: np.ndarray, to_labels: np.ndarray, volume: TensorVolume, what: str = "labels"
+) -> np.ndarray:
+    """Return labels or maps (…, *more) at an image's voxels; raise ValueError if they are not on the same voxels."""
     size = volume.volume_shape
     first, ends = np.rint(to_labels[:3, 3]).astype(int), corners(size)
     apart = np.abs((ends @ to_labels.T)[:, :3] - ends[:, :3] - first).max()
     box = tuple(slice(int(i), int(i) + n) for i, n in zip(first, size, strict=True))
-    inside = all(i >= 0 and i + n <= m for i, n, m in zip(first, size, values.shape, strict=True))
+    inside = all(i >= 0 and i + n <= m for i, n, m in zip(first, size, values.shape[:3], strict=True))
     if apart > 0.1 or not inside:  # in voxels
-        if values.shape != size and np.allclose(to_labels, np.eye(4)):
+        if values.shape[:3] != size and np.allclose(to_labels, np.eye(4)):
             raise ValueError(
-                f"{name}: got labels of shape {values.shape} with the image's affine; expected the image's shape "
-                f"{size}. One file was cropped or resampled without its affine: resample the labels to the image"
+                f"{name}: got {what} of shape {values.shape[:3]} with the image's affine; expected the image's shape "
+                f"{size}. One file was cropped or resampled without its affine: resample the {what} to the image"
             )
         raise ValueError(
-            f"{name}: the affines put the labels and the image on different voxels; expected the same voxels. "
-            "Resample the labels to the image by the nearest neighbour"
+            f"{name}: the affines put the {what} and the image on different voxels; expected the same voxels. "
+            f"Resample the {what} to the image" + " by the nearest neighbour" * (what == "labels")
         )
-    return values[box].reshape(volume.shape)
+    return values[box].reshape(*volume.shape, *values.shape[3:])

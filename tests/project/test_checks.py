@@ -138,6 +138,8 @@ COMPLEX = {
     "weights": lambda: hj.fit_metric(FIELD, np.ones((1, 4, 5)), [1.0], data=Data(weights=NODAL)),
     "functions": lambda: hj.heat_flow(pairs(), [1.0], NODAL),
     "functions of a scale space": lambda: hj.gaussian_scale_space(FIELD, [1.0], NODAL),
+    "c": lambda: hj.reconstruct(pairs(), np.ones(5) + 1j),
+    "f in modes": lambda: hj.decompose(pairs(), NODAL),
     "f": lambda: hj.laplace_beltrami(FIELD, NODAL),
     "f as a function": lambda: hj.laplace_beltrami(
         hj.TensorField.from_function(lambda x: jnp.eye(2), GRID), lambda x: 1j

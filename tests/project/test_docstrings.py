@@ -10,9 +10,9 @@ from test_documentation import ROOT, documented
 import hks_jax as hj
 
 MADE_BY_THE_LIBRARY = """
-Adjoint AutomaticHKS Colouring DegeneratePoints DenseEigenpairs Eigenpairs Eigensolver ExampleBrain FactorisedMatrix
-Identifiability MetricFit MirrorPencil Parametrisation Pencil Posterior Regulariser RegionStatistics Signature Step
-SymmetricPencil Truncation Uncertainty hks_jax.LogDeterminant
+Adjoint Alignment AutomaticHKS Colouring DegeneratePoints DenseEigenpairs Eigenpairs Eigensolver ExampleBrain
+FactorisedMatrix Identifiability MetricFit MirrorPencil ModeEnergies Parametrisation Pencil Posterior Regulariser
+RegionStatistics Signature Step SymmetricPencil Truncation Uncertainty hks_jax.LogDeterminant
 """  # results, and what is there to be subclassed
 NO_CALL = "AccuracyWarning RESULTS REPAIRS ORDERS UNITS examples"  # codes, choices, and a module
 SLOW = """

@@ -1,0 +1,183 @@
+"""The commands modes and smooth write what the library computes, on voxels, slices, surfaces and tetrahedra."""
+
+import csv
+import json
+import re
+
+import nibabel as nib
+import numpy as np
+import pytest
+
+import hks_jax as hj
+from hks_jax.cli import main
+from hks_jax.io import TensorVolume, save_tensors
+
+SHAPE = (8, 7, 5)
+AFFINE = np.array([[0, -2.0, 0, 5], [2.0, 0, 0, -3], [0, 0, -3.0, 1], [0, 0, 0, 1]])
+D = 1e-3 * np.array([[1.5, 0.2, 0.1], [0.2, 0.8, 0.0], [0.1, 0.0, 0.6]])
+MASK = np.hypot(*(np.indices(SHAPE)[:2] - 3.5)) < 4.2
+
+
+@pytest.fixture
+def tensors(tmp_path):
+    values = np.where(MASK[..., None, None], D * (1 + 0.1 * np.indices(SHAPE)[0][..., None, None]), 0)
+    return str(save_tensors(tmp_path / "t.nii.gz", TensorVolume(values, (2.0, 2.0, 3.0), (0.0,) * 3, affine=AFFINE)))
+
+
+@pytest.fixture
+def series(tmp_path):
+    """Two maps of noise, unmeasured at one voxel of the mask and outside the mask."""
+    values = np.random.default_rng(0).normal(size=(*SHAPE, 2))
+    values[~MASK] = values[3, 3, 2] = np.nan
+    nib.save(nib.Nifti1Image(values, AFFINE), tmp_path / "bold.nii.gz")
+    return str(tmp_path / "bold.nii.gz"), np.moveaxis(values, -1, 0)
+
+
+def rows(path):
+    with open(path, encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream, delimiter="\t"))
+
+
+def surface(path):
+    mesh = hj.examples.sphere_mesh(2)
+    kinds = (("POINTSET", "FLOAT32", mesh.vertices), ("TRIANGLE", "INT32", mesh.faces))
+    arrays = [
+        nib.gifti.GiftiDataArray(np.asarray(x, d.lower()), f"NIFTI_INTENT_{kind}", f"NIFTI_TYPE_{d}")
+        for kind, d, x in kinds
+    ]
+    nib.save(nib.gifti.GiftiImage(darrays=arrays), path)
+    return mesh
+
+
+def test_modes_and_coefficients_of_a_series_are_those_of_the_library(tensors, series, tmp_path, capsys):
+    name, maps = series
+    out = tmp_path / "out"
+    assert main(["modes", tensors, "-o", str(out), "--operator", "fick", "-k", "12", "--map", name, "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["settings"]["boundary"] == "neumann"
+    volume = hj.io.read_tensors(tensors)
+    volume = volume.with_mask(MASK)
+    field = hj.TensorField.from_diffusion(volume.grid("all"), volume.tensors, operator="fick")
+    pairs = hj.eigenpairs(field, 12)
+    image = nib.load(out / "modes.nii.gz")
+    modes = np.moveaxis(image.get_fdata(), -1, 0)
+    np.testing.assert_allclose(image.affine, AFFINE)
+    np.testing.assert_array_equal(np.isnan(modes[0]), ~MASK)
+    expected = np.asarray(pairs.eigenfunctions)
+    sign = np.sign(np.nansum(modes * expected, axis=(1, 2, 3)))
+    np.testing.assert_allclose(sign[:, None, None, None] * modes, expected, atol=1e-5)
+    table, sidecar = rows(out / "modes.tsv"), json.loads((out / "modes.json").read_text())
+    found = hj.energy(pairs, maps)
+    np.testing.assert_allclose([float(row["eigenvalue"]) for row in table], pairs.eigenvalues, rtol=1e-6, atol=1e-18)
+    assert table[0]["wavelength"] == "n/a"
+    assert sidecar["Wavelengths"][0] is None
+    assert sidecar["LengthUnits"] == "mm"
+    np.testing.assert_allclose(sidecar["Wavelengths"][1:], found.wavelength[1:], rtol=1e-6)
+    c = np.array([[float(row[f"map_{i}"]) for row in rows(out / "coefficients.tsv")] for i in (1, 2)])
+    np.testing.assert_allclose(c * sign, hj.decompose(pairs, maps), rtol=1e-4, atol=1e-5)
+    explained = [float(row["explained"]) for row in rows(out / "energies.tsv")]
+    np.testing.assert_allclose(explained, np.asarray(found.explained).mean(axis=0), atol=1e-6)
+    projected = np.moveaxis(nib.load(out / "reconstruction.nii.gz").get_fdata(), -1, 0)
+    np.testing.assert_allclose(projected, hj.reconstruct(pairs, hj.decompose(pairs, maps)), atol=1e-4)
+
+
+@pytest.mark.slow
+def test_a_slice_reads_its_part_of_a_volume_of_maps_and_saved_pairs_serve(tensors, series, tmp_path):
+    name, _ = series
+    read = [tensors, "--slice", "z=3", "--operator", "fick", "-k", "8", "-q"]
+    assert main(["hks", *read, "-o", str(tmp_path / "pairs"), "--save-pairs", "--boundary", "neumann"]) == 0
+    saved = str(tmp_path / "pairs" / "pairs.npz")
+    assert main(["modes", *read, "-o", str(tmp_path / "a"), "--map", name]) == 0
+    assert main(["modes", saved, "-o", str(tmp_path / "b"), "--map", name, "-q"]) == 0
+    first, second = (
+        [abs(float(row["map_2"])) for row in rows(tmp_path / folder / "coefficients.tsv")] for folder in "ab"
+    )
+    np.testing.assert_allclose(first, second, rtol=1e-6, atol=1e-9)
+    image = nib.load(tmp_path / "b" / "reconstruction.nii.gz")
+    assert image.shape == (8, 7, 1, 2)
+    assert np.isnan(image.get_fdata()).all(axis=-1).sum() == (~MASK[..., 3]).sum()
+
+
+def test_surfaces_and_tetrahedra(tmp_path, capsys):
+    mesh = surface(tmp_path / "s.surf.gii")
+    np.save(tmp_path / "x.npy", np.asarray(mesh.vertices)[:, 0])
+    out = tmp_path / "out"
+    assert main(["modes", str(tmp_path / "s.surf.gii"), "-o", str(out), "-k", "9", "-q"]) == 0
+    modes = np.stack([array.data for array in nib.load(out / "modes.func.gii").darrays])
+    assert modes.shape == (9, 42)
+    again = ["modes", str(tmp_path / "s.surf.gii"), "-o", str(tmp_path / "two"), "-k", "9", "-q", "--map"]
+    assert main([*again, str(out / "modes.func.gii")]) == 0
+    c = [[float(row[f"map_{i}"]) for i in range(1, 10)] for row in rows(tmp_path / "two" / "coefficients.tsv")]
+    gram = np.abs(np.array(c).T @ np.array(c))
+    np.testing.assert_allclose(gram, np.eye(9), atol=1e-5)
+    assert main([*again, str(tmp_path / "x.npy")]) == 0
+    assert not (tmp_path / "two" / "modes.nii.gz").exists()
+    # The coordinate x is a mode of the sphere: the first three after the constant.
+    assert float(rows(tmp_path / "two" / "energies.tsv")[3]["explained"]) > 0.99
+    ball = hj.examples.ball_mesh(2)
+    hj.io.save(tmp_path / "ball.vtu", np.zeros(len(ball.vertices)), ball)
+    assert main(["modes", str(tmp_path / "ball.vtu"), "-o", str(tmp_path / "three"), "-k", "5", "-q"]) == 0
+    arrays = hj.io.read_mesh_arrays(tmp_path / "three" / "modes.vtu")
+    assert len(arrays) == 5
+    assert not (tmp_path / "three" / "modes.func.gii").exists()
+
+
+def test_maps_that_are_refused(tensors, series, tmp_path, capsys):
+    _, maps = series
+    values = np.moveaxis(maps, 0, -1)
+    mine, shifted = AFFINE.copy(), AFFINE.copy()
+    shifted[0, 3] += 1
+    nib.save(nib.Nifti1Image(values, shifted), tmp_path / "shifted.nii.gz")
+    nib.save(nib.Nifti1Image(values[:-1], mine), tmp_path / "small.nii.gz")
+    some = values.copy()
+    some[4, 4, 1, 0] = np.nan
+    nib.save(nib.Nifti1Image(some, mine), tmp_path / "some.nii.gz")
+    np.save(tmp_path / "flat.npy", np.ones((3, 3)))
+    surface(tmp_path / "s.surf.gii")
+    out = tmp_path / "out"
+    read = ["modes", tensors, "-o", str(out), "--operator", "fick", "-k", "5", "-q", "--map"]
+    calls = {
+        "shifted.nii.gz": "the affines put the maps and the image on different voxels.*The affines .*6.0.* and .*5.0",
+        "small.nii.gz": r"got maps of shape \(7, 7, 5\) with the image's affine",
+        "some.nii.gz": "--map: got 1 nodes with NaN in only some of 2 maps",
+        "flat.npy": r"got maps of shape \(3, 3\); expected \(8, 7, 5\), or \(8, 7, 5, 'n'\)",
+        "none.nii.gz": "none.nii.gz",
+    }
+    for file, message in calls.items():
+        assert main([*read, str(tmp_path / file)]) == 2
+        assert re.search(message, capsys.readouterr().err), file
+    of_mesh = ["modes", str(tmp_path / "s.surf.gii"), "-o", str(out), "-k", "5", "-q", "--map"]
+    assert main([*of_mesh, str(tmp_path / "flat.npy")]) == 2
+    assert "expected one number for each of the 42 vertices" in capsys.readouterr().err
+    assert main([*of_mesh, str(tmp_path / "s.surf.gii")]) == 2
+    assert "got no arrays of values" in capsys.readouterr().err
+    assert not out.exists()
+    out.mkdir()
+    np.save(out / "modes.npy", np.ones(SHAPE))
+    assert main([*read, str(out / "modes.npy")]) == 2
+    assert "modes.npy: this input file would be replaced by the output" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_maps_are_smoothed_as_by_the_library(tensors, tmp_path, capsys):
+    f = np.random.default_rng(1).normal(size=(*SHAPE, 2))
+    nib.save(nib.Nifti1Image(f, AFFINE), tmp_path / "bold.nii.gz")
+    out, name = tmp_path / "out", str(tmp_path / "bold.nii.gz")
+    volume = hj.io.read_tensors(tensors).with_mask(MASK)
+    command = ["smooth", name, "--tensors", tensors, "-o", str(out), "-q"]
+    for operator, settings in (("fick", {"operator": "fick"}), ("laplace-beltrami", {"metric": "inverse"})):
+        assert main([*command, "--fwhm", "6", "--operator", operator]) == 0
+        found = np.moveaxis(nib.load(out / "smoothed.nii.gz").get_fdata(), -1, 0)
+        field = hj.TensorField.from_diffusion(volume.grid("all"), volume.tensors, **settings)
+        np.testing.assert_allclose(found, hj.smooth(field, np.moveaxis(f, -1, 0), 6.0), atol=1e-5)
+        assert (out / "smoothed.png").stat().st_size > 5000
+    assert main([*command, "--fwhm", "2"]) == 2
+    assert "--fwhm: got 2 on a grid with the spacing 3, which does not resolve it" in capsys.readouterr().err
+    f[3, 3, 2, 1] = np.nan
+    nib.save(nib.Nifti1Image(f, AFFINE), tmp_path / "bold.nii.gz")
+    assert main([*command, "--fwhm", "6"]) == 2
+    assert "got NaN or infinite values at 1 voxels inside the mask" in capsys.readouterr().err
+    assert main(["smooth", name, name, "--tensors", tensors, "--fwhm", "6", "-o", str(out)]) == 2
+    assert "expected one file of maps" in capsys.readouterr().err
+    assert main(["smooth", name, "--tensors", str(out / "smoothed.nii.gz"), "--fwhm", "6", "-o", str(out)]) == 2
+    assert "this input file would be replaced" in capsys.readouterr().err
