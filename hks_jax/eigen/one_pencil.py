@@ -198,8 +198,8 @@ def _pairs(
         no = jnp.zeros(0, bool)
         quality = jnp.zeros(0, values.dtype), no, no, jnp.asarray(1e-6, values.dtype)
     residuals, converged, zero, tolerance = quality
-    held = jax.lax.stop_gradient((solved_pencil, frame, values, origin, zero))
-    small, rounding = _near_zero(*held, known, solver)
+    constants = jax.lax.stop_gradient((solved_pencil, frame, values, origin, zero))
+    small, rounding = _near_zero(*constants, known, solver)
     # While differentiating, JAX may turn a constant array into a Python number.
     following, bound = jax_array(following), jax_array(bound)
     if not known:
