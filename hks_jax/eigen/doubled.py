@@ -87,11 +87,7 @@ def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: i
         with_rotations(p.frame, jax.lax.stop_gradient(p.eigenvalues), c[:, None] & ~c[None], None, p.pencil)
         for p, c in zip(solved, chosen, strict=True)
     ]
-
-    def together(rows: list[Float[Array, "_ _"]]) -> Float[Array, "k n_dof"]:
-        # An eigenfunction has norm 1 on the domain doubled m times, hence norm 1/√2ᵐ on the domain itself.
-        of_all = [pairs.space.transfer(own, pencil.space) for pairs, own in zip(solved, rows, strict=True)]
-        return jnp.concatenate(of_all)[lowest] / math.sqrt(len(solved))
+    rows = [p.space.transfer(own, pencil.space) for p, own in zip(solved, frames, strict=True)]
 
     return Eigenpairs(
         eigenvalues=values[lowest],
@@ -104,7 +100,8 @@ def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: i
         spectral_origin=solved[0].spectral_origin,
         multiplet_tolerance=jnp.max(jnp.stack([pairs.multiplet_tolerance for pairs in solved])),
         part=jax_array(np.repeat(np.arange(len(solved)), sizes))[lowest],
-        frame=together(frames),
+        # An eigenfunction has norm 1 on the domain doubled m times, hence norm 1/√2ᵐ on the domain itself.
+        frame=jnp.concatenate(rows)[lowest] / math.sqrt(len(solved)),
         pencil=pencil,
         solver_name=" + ".join(dict.fromkeys(pairs.solver_name for pairs in solved)),
         lowest=solved[0].lowest,

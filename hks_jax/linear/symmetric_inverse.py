@@ -74,7 +74,7 @@ def by_eigenvalues(matrices: Matrices, least: Pivots) -> Inverses:
 def by_elimination(matrices: Matrices, least: Pivots) -> Inverses:
     """Sweep the matrices block by block, and each block row by row."""
     size = min(matrices.shape[1], _ROWS)
-    return _by_blocks(lambda blocks, least: jax.vmap(_sweep)(blocks, least), size, matrices, least)
+    return _by_blocks(jax.vmap(_sweep), size, matrices, least)
 
 
 def _by_blocks(invert: Callable[[Array, Array], Inverses], size: int, matrices: Matrices, least: Pivots) -> Inverses:

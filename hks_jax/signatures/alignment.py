@@ -134,7 +134,7 @@ def _parts(pairs: Eigenpairs) -> Int[np.ndarray, " k"]:
 def _groups(pairs: Eigenpairs, gap: float | None) -> Int[np.ndarray, " k"]:
     """Return the number of each mode's group.
 
-    A group has modes of one part of a doubled domain, of which all or none are kept.
+    All modes of a group belong to one part of a doubled domain. Either all of them are kept, or none is.
     """
     values, part = np.asarray(pairs.eigenvalues, np.float64), 2 * _parts(pairs) + np.asarray(pairs.kept)
     labels = np.asarray(pairs.multiplets)

@@ -19,7 +19,7 @@ import hks_jax as hj
 from .harness import Outcome
 
 _ROUNDING = 4 * np.finfo(np.float32).eps
-"""The effect of rounding, in units of Σ|φᵢ||Kᵢⱼ||φⱼ|: of the entries of K, of M, and of what they are made of."""
+"""The error that rounding of fields and matrices to float32 may cause, relative to Σ|φᵢ||Kᵢⱼ||φⱼ|."""
 
 
 def check(seed: int) -> Outcome:
