@@ -32,7 +32,7 @@ BLOCK = 16
 WINDOW = 32
 """The number of eigenvectors nearest to a shift that every conjugate gradient step projects out."""
 _GROWTH = 4e7
-"""The largest factor by which solves amplify rounding errors along computed eigenvectors; 1e4 to 1e5 is usual."""
+"""The largest factor by which solves amplify rounding errors along other computed eigenvectors; 1e4 to 1e5 is usual."""
 _MEMORY = 5e8
 """The maximal total size of the factorisations in bytes."""
 
@@ -90,10 +90,11 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         factors, shifts = prepared
         k, tolerance = len(rhs), complement.attainable(self.tolerance, rhs.dtype)
         clean = complement.without_known(pencil, vectors)
+        window = WINDOW if _GROWTH * jnp.finfo(rhs.dtype).eps <= tolerance else len(values)
 
         def solver_of(group: Int[Array, ""]) -> Callable[..., Columns]:
             arrays = jax.tree.map(lambda stacked: stacked[group], factors.arrays)
-            near = vectors[jnp.argsort(jnp.abs(values - shifts[group]))[:WINDOW]]
+            near = vectors[jnp.argsort(jnp.abs(values - shifts[group]))[:window]]
             columns, images = near.T, pencil.mass.apply(near)
 
             def without_near(x: Columns) -> Columns:
@@ -105,8 +106,7 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         left, wanted = complement.projected(pencil, vectors, rhs, tolerance, self._amplified(pencil, values, k))
         first, _ = self.groups(factors.dissection, len(values), k, values.dtype)
         x = complement.solve_in_blocks(solver_of, BLOCK, first, left, wanted, values[:k])
-        clean_enough = not isinstance(self, InteriorAdjoint) and _GROWTH * jnp.finfo(rhs.dtype).eps <= tolerance
-        return x if clean_enough else complement.cleaned(pencil, vectors, x)
+        return complement.cleaned(pencil, vectors, x) if isinstance(self, InteriorAdjoint) else x
 
     def groups(self, dissection: Dissection, p: int, k: int, dtype: np.dtype) -> Groups:
         """Return the first and the last row of each group of right-hand sides, which `group_numbers` determines."""
@@ -134,7 +134,8 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
 
     # If rounding leaves a component of the residual along a computed eigenvector φⱼ, each step multiplies this
     # component by (λⱼ − λᵢ)/(λⱼ − σ), which is large mainly for λⱼ near σ. So each step projects out only the
-    # eigenvectors φⱼ with λⱼ nearest to σ. Other computed eigenvectors are projected out at restarts and at the end.
+    # eigenvectors φⱼ with λⱼ nearest to σ, unless the others would spoil the last digits that the tolerance asks for.
+    # Restarts project out all computed eigenvectors.
     def _solve_block(
         self, pencil: Any, values: Values, without_near: OfColumns, without_known: OfColumns, *of_block: Any
     ) -> Columns:
