@@ -4,12 +4,13 @@ Compute the eigenfunctions of the Laplace-Beltrami operator, or of Fick's operat
 read as in 'hks-jax hks': tensors of a volume or a slice, a mesh, or eigenpairs written by 'hks-jax hks --save-pairs'.
 
 The command writes to the folder OUT: modes.npz, and the modes in FILE's format (for NIfTI, along the fourth axis of
-modes.nii.gz; for a surface also modes.func.gii); modes.json and modes.tsv with the eigenvalues, and with the
-wavelengths and widths for which the modes stand; and report.json.
+modes.nii.gz; for a GIFTI or FreeSurfer surface, modes.vtu and modes.func.gii); modes.json and modes.tsv with the
+eigenvalues, and with the wavelengths and widths for which the modes stand; modes.png; and report.json.
 
 With --map, the command also writes coefficients.tsv, with a column for each map, in the inner product of the domain's
 mass; energies.tsv, the energy in each mode and the share of variance that the modes up to it explain, both as means
-over the maps; and reconstruction.npz and an image, the projections of the maps onto the modes.
+over the maps; and reconstruction.npz and an image, the projections of the maps onto the modes. The picture then also
+shows the energies by wavelength, and the first map through a few numbers of modes.
 
 The default boundary condition is neumann even for a mask, because with mean half of the modes are odd, and no map has a
 part in them.
@@ -17,7 +18,7 @@ part in them.
 examples:
   hks-jax modes tensor.nii.gz -o out --mask mask.nii.gz --operator fick -k 200
   hks-jax modes tensor.nii.gz -o out --operator fick -k 200 --map bold.nii.gz
-  hks-jax modes lh.white -o out --inside lh.cortex.label -k 200 --map lh.thickness.shape.gii
+  hks-jax modes lh.white -o out --inside lh.cortex.label -k 200 --map lh.thickness
   hks-jax modes out/pairs.npz -o out --map bold.nii.gz
 """
 
@@ -29,30 +30,31 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hks_jax import Eigenpairs, SurfaceMesh, assemble, decompose, energy, reconstruct
-from hks_jax.cli import hks
+from hks_jax import Eigenpairs, ModeEnergies, energy, reconstruct
 from hks_jax.cli import pairs as saved_pairs
-from hks_jax.cli.computation import Settings, compute_pairs, describe_input, describe_pairs, solve
+from hks_jax.cli.computation import Settings, compute_pairs, describe_input, describe_pairs
 from hks_jax.cli.info import describe_mesh
+from hks_jax.cli.meshes import OF_MESHES, domain_of, images_of_mesh, solve_mesh
 from hks_jax.cli.options import READING, SOLVING, options_in, refuse
 from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read_volume, require_metric
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.io import TensorVolume, read_maps, save
+from hks_jax.io.cortex import MAPS
 from hks_jax.io.formats import WRITTEN, format_of
-from hks_jax.io.maps import write_gifti
 from hks_jax.io.mesh import WRITTEN as MESHES_WRITTEN
 from hks_jax.io.mesh import is_mesh
 from hks_jax.io.tables import write_json, write_table
+from hks_jax.signatures.modes import lengths_of
 
 OPTIONS = f"""
 @file @metric {READING} @output {SOLVING}
-{hks.OF_MESHES}
+{OF_MESHES}
 --map FILE
-    a map or a series of maps (4D): NIfTI, MRtrix, NRRD or .npy on the voxels of FILE; for a mesh GIFTI or .npy, one
-    value per vertex. NaN marks unmeasured voxels or vertices, to which the modes are fitted by least squares; zeros are
-    values. Values outside the mask are not used
+    a map or a series of maps (4D): NIfTI, MRtrix, NRRD or .npy on the voxels of FILE; for a mesh GIFTI, FreeSurfer's
+    maps (lh.thickness, lh.curv, …) or .npy, one value per vertex. NaN marks unmeasured voxels or vertices: the modes
+    are fitted to the others by least squares. Zeros are values. Values outside the mask are not used
 """
 
 TABLES = ("modes.tsv", "modes.json", "coefficients.tsv", "energies.tsv")
@@ -62,7 +64,7 @@ class _Solved(NamedTuple):
     place: TensorVolume | SimplicialMesh
     pairs: Eigenpairs
     settings: Settings
-    image: str  # the suffix of images
+    images: tuple[str, ...]  # the suffixes of images
     about: dict[str, Any]  # the entries of the report about the input
 
 
@@ -86,9 +88,10 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
             maps = read_maps(args.map, place)
     with progress.stage("modes"):
         functions = np.asarray(pairs.eigenfunctions)
-        columns = _columns(pairs, functions if maps is None else maps)
-        coefficients = None if maps is None else np.asarray(decompose(pairs, maps))
-        projected = None if maps is None else np.asarray(reconstruct(pairs, coefficients))
+        wavelength, fwhm = (np.asarray(lengths) for lengths in lengths_of(pairs))
+        known = {"eigenvalue": np.asarray(pairs.eigenvalues), "wavelength": wavelength, "fwhm": fwhm}
+        found = None if maps is None else energy(pairs, maps)
+        projected = None if found is None else np.asarray(reconstruct(pairs, found.coefficients))
     report = {
         "input": solved.about,
         "settings": {name: asdict(solved.settings)[name] for name in _SETTINGS} | {"k": pairs.k},
@@ -96,17 +99,16 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         "units": {"length": getattr(place, "length_unit", "") or None},
         "map": None if maps is None else {"source": str(args.map), "maps": len(maps)},
     }
-    known = {name: columns[name] for name in ("eigenvalue", "wavelength", "fwhm")}
     with writing(args.output, report, progress, lambda: _stale(args)) as (folder, done):
         _write(folder, "modes", functions, solved, {"eigenvalues": np.asarray(pairs.eigenvalues)})
         _tabulate(folder / "modes.tsv", known)
         write_json(folder / "modes.json", _sidecar(solved, known))
-        if maps is not None:
-            assert coefficients is not None
+        if found is not None:
             assert projected is not None
             _write(folder, "reconstruction", projected, solved, {})
-            _tabulate(folder / "energies.tsv", columns)
-            _tabulate(folder / "coefficients.tsv", {f"map_{i + 1}": column for i, column in enumerate(coefficients)})
+            _tabulate(folder / "energies.tsv", known | _means(found))
+            columns = {f"map_{i + 1}": column for i, column in enumerate(np.asarray(found.coefficients))}
+            _tabulate(folder / "coefficients.tsv", columns)
     return done
 
 
@@ -125,37 +127,22 @@ def _on_grid(args: argparse.Namespace, progress: Progress) -> _Solved:
         require_metric(args)
         volume, image = read_volume(args, progress), format_of(args.file).image
         solved = compute_pairs(volume, settings, progress)
-    return _Solved(solved.volume, solved.pairs, solved.settings, image, describe_input(solved.volume))
+    return _Solved(solved.volume, solved.pairs, solved.settings, (image,), describe_input(solved.volume))
 
 
 def _on_mesh(args: argparse.Namespace, progress: Progress) -> _Solved:
-    others = {option.name: option.settings.get("default") for option in options_in(hks.OPTIONS)}
-    switches = {option.name: False for option in options_in(hks.OPTIONS) if "action" in option.settings}
-    every = argparse.Namespace(**others | switches | vars(args))
-    hks.check_mesh_options(every)
-    with progress.stage("reading", str(args.file)):
-        mesh, _ = hks.read_domain(every, progress)
-    boundary = args.boundary or "neumann"
-    settings = Settings.of(args, metric=args.metric, boundary=boundary)
-    with progress.stage("assembly", f"{len(mesh.vertices)} vertices"):
-        pencil = assemble(mesh, boundary)
-    pairs = solve(pencil, settings, progress)
+    mesh = domain_of(args, progress).mesh
+    pairs, settings = solve_mesh(mesh, Settings.of(args, metric=args.metric), progress)
     about = {"source": str(args.file), **describe_mesh(args.file, mesh)}
-    return _Solved(mesh, pairs, settings, hks.image_of_mesh(args.file, mesh), about)
+    return _Solved(mesh, pairs, settings, images_of_mesh(args.file, mesh, args.clean), about)
 
 
-def _columns(pairs: Eigenpairs, maps: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the columns of the table of energies; energies and shares of variance are means over the maps."""
-    found = energy(pairs, maps)
+def _means(found: ModeEnergies) -> dict[str, np.ndarray]:
+    """Return the means over the maps of the energies and of the shares of variance."""
     explained = np.asarray(found.explained)
     varies = np.isfinite(explained).all(axis=1)
-    return {
-        "eigenvalue": np.asarray(found.eigenvalues),
-        "wavelength": np.asarray(found.wavelength),
-        "fwhm": np.asarray(found.fwhm),
-        "energy": np.asarray(found.energy).mean(axis=0),
-        "explained": explained[varies].mean(axis=0) if varies.any() else np.full(pairs.k, np.nan),
-    }
+    share = explained[varies].mean(axis=0) if varies.any() else np.full(explained.shape[1], np.nan)
+    return {"energy": np.asarray(found.energy).mean(axis=0), "explained": share}
 
 
 def _tabulate(path: Path, columns: Mapping[str, np.ndarray]) -> None:
@@ -179,18 +166,15 @@ def _sidecar(solved: _Solved, known: Mapping[str, np.ndarray]) -> dict[str, Any]
 
 
 def _write(folder: Path, name: str, values: np.ndarray, solved: _Solved, extra: Mapping[str, Any]) -> None:
-    """Write modes or maps (m, *shape) as .npz, as an image, and on a surface in GIFTI."""
+    """Write modes or maps (m, *shape) as .npz and as images."""
     save(folder / f"{name}.npz", values, solved.place, name=name, extra=extra)
-    if solved.image:
-        more = {} if solved.image.startswith(".nii") else extra
-        save(folder / f"{name}{solved.image}", values.astype(np.float32), solved.place, name=name, extra=more)
-    if isinstance(solved.place, SurfaceMesh):
-        word = name.removesuffix("s")
-        write_gifti(folder / f"{name}.func.gii", values, [f"{word} {i + 1}" for i in range(len(values))])
+    for suffix in filter(None, solved.images):
+        more = {} if suffix.startswith(".nii") else extra
+        save(folder / f"{name}{suffix}", values.astype(np.float32), solved.place, name=name, extra=more)
 
 
 def _stale(args: argparse.Namespace) -> Iterable[Path]:
     """Return the files of an earlier call."""
-    suffixes = (".npz", ".func.gii", *WRITTEN, *MESHES_WRITTEN)
+    suffixes = (".npz", MAPS, *WRITTEN, *MESHES_WRITTEN)
     names = [f"{name}{suffix}" for name in ("modes", "reconstruction") for suffix in suffixes]
     return [args.output / name for name in (*TABLES, *names)]

@@ -243,7 +243,7 @@ def defaults(text: str) -> argparse.Namespace:
 def refuse(args: argparse.Namespace, names: Iterable[str], why: str) -> None:
     """Raise ValueError with the reason `why` if one of the named options is given."""
     usual = vars(defaults(" ".join(f"@{name}" for name in SECTIONS if name not in ("file", "output"))))
-    for name in names:
+    for name in (name for name in names if name in vars(args)):  # a command may lack some of these options
         if getattr(args, name) != usual.get(name) and getattr(args, name) is not False:
             raise ValueError(f"{flag(name)}: {why}")
 

@@ -2,45 +2,78 @@
 
 Smooth a map, or a series of maps (4D), by the diffusion of a substance in the tissue, div(D∇u) with the diffusion
 tensors D: more along fibres than across them, and only within the mask. The diffusion's time is that in which the
-mean full width at half maximum is --fwhm, in mm. The integral of the map is kept. FILE has the maps on the voxels of
-the tensors: NIfTI, MRtrix, NRRD or .npy. The options on voxels and on the meaning of numbers refer to the tensors.
+mean full width at half maximum is --fwhm, in mm. The integral of the map is kept, except with dirichlet.
 
-The command writes to the folder OUT: smoothed.npz, an image in the tensors' format (smoothed.nii.gz, .nrrd or .vti),
-report.json, and smoothed.png, which compares the first map with isotropic smoothing of the same width.
+FILE has the maps: on the voxels of the tensors (NIfTI, MRtrix, NRRD or .npy), or with --mesh at the vertices of a
+surface or of tetrahedra (GIFTI, FreeSurfer's maps such as lh.thickness, or .npy). On a surface, maps are smoothed
+within it by the tangential parts of the tensors, and without tensors equally in all its directions. The options on
+voxels and on the meaning of numbers refer to the tensors.
+
+The command writes to the folder OUT: smoothed.npz, an image in the tensors' format (smoothed.nii.gz, .nrrd or .vti) or
+a mesh (smoothed.vtu; for a GIFTI or FreeSurfer surface also smoothed.func.gii), report.json, and smoothed.png, which
+compares the first map with isotropic smoothing of the same width.
 
 examples:
   hks-jax smooth bold.nii.gz --tensors dti.nii.gz --fwhm 6 -o out --mask mask.nii.gz
   hks-jax smooth fa.nii.gz --tensors dti.nii.gz --fwhm 4 -o out --mask mask.nii.gz --slice z=14
+  hks-jax smooth lh.thickness --mesh lh.white --inside lh.cortex.label --fwhm 10 -o out
+  hks-jax smooth lh.thickness --mesh lh.white --tensors dti.nii.gz --fwhm 10 -o out
 """
 
 import argparse
 import math
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool
 
-from hks_jax import TensorField, gaussian_scale_space
+from hks_jax import SurfaceMesh, TensorField, gaussian_scale_space
 from hks_jax.cli.computation import Settings, describe_input, field_of
-from hks_jax.cli.options import READING
+from hks_jax.cli.info import describe_mesh
+from hks_jax.cli.meshes import OF_VERTICES, Domain, check_boundary, images_of_mesh, read_domain, volume_around
+from hks_jax.cli.options import READING, options_in, refuse
 from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read_volume
+from hks_jax.domain.simplicial_mesh import SimplicialMesh
+from hks_jax.fem.boundary import unreached_sides
 from hks_jax.io import TensorVolume, read_maps, save
+from hks_jax.io.cortex import MAPS
 from hks_jax.io.formats import WRITTEN, format_of
+from hks_jax.io.mesh import WRITTEN as MESHES_WRITTEN
 from hks_jax.spectrum_free.smoothing import smooth
 
 OPTIONS = f"""
 file FILE...  the maps
---tensors FILE!  the diffusion tensors
---fwhm LENGTH!  mean full width at half maximum of the smoothing, in mm, at least the voxel size
-{READING} @domain @dtype @output
+--fwhm LENGTH!
+    mean full width at half maximum of the smoothing, in mm, at least the voxel size, or the median edge of a mesh
+--tensors FILE  the diffusion tensors; required unless --mesh is given
+--mesh FILE
+    the mesh at whose vertices the maps are. With --tensors, the tensors of this volume are interpolated at the vertices
+    in scanner coordinates, as in 'hks-jax hks'; with --array, the mesh's file has them
+{OF_VERTICES}
+{READING} @domain @dtype @interpolation @output
 --operator fick|laplace-beltrami = fick
     fick: the diffusion of a substance by Fick's law (default), whose density becomes uniform in space.
     laplace-beltrami: the heat flow of the metric D⁻¹, which keeps the integral with the volume of this metric
+--boundary CONDITION = neumann
+    condition at the boundary of the domain: neumann (nothing flows through it, the default); dirichlet (the map is 0 at
+    the sides of the image, or at the boundary of a mesh); dirichlet-rim (also at the boundary of a mask); or periodic.
+    Give one condition for all axes, or one per axis
 @view
 """
+
+
+class _Place(NamedTuple):
+    place: TensorVolume | SimplicialMesh
+    domain: TensorField | SimplicialMesh
+    inside: Bool[np.ndarray, "*shape"]
+    images: tuple[str, ...]  # the suffixes of images
+    about: dict[str, Any]  # the entries of the report about the input
+    draw: Callable[..., None]
 
 
 def writes(args: argparse.Namespace) -> list[Path]:
@@ -52,36 +85,77 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
     if args.others:
         raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one file of maps")
-    metric = None if args.operator == "fick" else "inverse"
-    of_tensors = argparse.Namespace(**vars(args) | {"file": args.tensors, "metric": metric})
-    volume = read_volume(of_tensors, progress)
-    settings = Settings.of(of_tensors, metric=metric)
-    field = field_of(volume, volume.grid(args.components), settings)
-    volume = volume.with_mask(field.grid.mask)
+    place, domain, inside, images, about, draw = (_on_grid if args.mesh is None else _on_mesh)(args, progress)
     with progress.stage("reading", str(args.file)):
-        maps = read_maps(args.file, volume)
-    if unknown := int((~np.isfinite(maps[:, field.grid.inside])).any(axis=0).sum()):
+        maps = read_maps(args.file, place)
+    where = "voxels" if args.mesh is None else "vertices"
+    if unknown := int((~np.isfinite(maps[:, inside])).any(axis=0).sum()):
+        remedy = "a --mask" if args.mesh is None else "an --inside"
         raise ValueError(
-            f"{args.file}: got NaN or infinite values at {unknown} voxels inside the mask; expected finite values. "
-            "Pass a --mask without these voxels"
+            f"{args.file}: got NaN or infinite values at {unknown} {where} inside the mask; expected finite values. "
+            f"Pass {remedy} without these {where}"
         )
-    with progress.stage("smoothing", f"{len(maps)} maps at {int(field.grid.inside.sum())} voxels"):
-        smoothed = np.asarray(smooth(field, maps, args.fwhm))
+    with progress.stage("smoothing", f"{len(maps)} maps at {int(inside.sum())} {where}"):
+        smoothed = np.asarray(smooth(domain, maps, args.fwhm, args.boundary))
+    chosen = ("fwhm", "operator", "interpolation", "boundary", "dtype", "components")
     report = {
-        "input": {**describe_input(volume), "maps": {"source": str(args.file), "number": len(maps)}},
-        "settings": {"fwhm": args.fwhm, "operator": args.operator, "dtype": args.dtype, "components": args.components},
+        "input": {**about, "maps": {"source": str(args.file), "number": len(maps)}},
+        "settings": {name: getattr(args, name) for name in chosen},
     }
-    stale = [args.output / f"smoothed{suffix}" for suffix in WRITTEN]
-    draw = partial(_draw, args, volume, maps[0], smoothed[0])
-    with writing(args.output, report, progress, lambda: stale, {"smoothed.png": draw}) as (folder, done):
+    stale = [args.output / f"smoothed{suffix}" for suffix in (MAPS, *WRITTEN, *MESHES_WRITTEN)]
+    pictures = {"smoothed.png": partial(draw, args, maps[0], smoothed[0])}
+    with writing(args.output, report, progress, lambda: stale, pictures) as (folder, done):
         values = smoothed if len(smoothed) > 1 else smoothed[0]
-        for suffix in filter(None, (".npz", format_of(args.tensors).image)):
+        for suffix in filter(None, (".npz", *images)):
             stored = values if suffix == ".npz" else values.astype(np.float32)
-            save(folder / f"smoothed{suffix}", stored, volume, name="smoothed", provenance=report["settings"])
+            save(folder / f"smoothed{suffix}", stored, place, name="smoothed", provenance=report["settings"])
     return done
 
 
-def _draw(args: argparse.Namespace, volume: TensorVolume, before: np.ndarray, after: np.ndarray, path: Path) -> None:
+def _on_grid(args: argparse.Namespace, progress: Progress) -> _Place:
+    if args.tensors is None:
+        raise ValueError(
+            "--tensors: got no file; expected the diffusion tensors of the voxels, or the mesh of the maps"
+        )
+    refuse(args, ("clean", "inside"), "this option is for meshes; for tensors on a grid, see --repair and --mask")
+    metric = None if args.operator == "fick" else "inverse"
+    of_tensors = argparse.Namespace(**vars(args) | {"file": args.tensors, "metric": metric})
+    volume = read_volume(of_tensors, progress)
+    field = field_of(volume, volume.grid(args.components), Settings.of(of_tensors, metric=metric))
+    for message in unreached_sides(field.grid.inside, args.boundary):
+        progress.warn(message)
+    volume = volume.with_mask(field.grid.mask)
+    images = (format_of(args.tensors).image,)
+    return _Place(volume, field, field.grid.inside, images, describe_input(volume), partial(_draw, volume))
+
+
+def _on_mesh(args: argparse.Namespace, progress: Progress) -> _Place:
+    of_grids = ["slice", "view", "components"]
+    if args.tensors is None:  # with --tensors, the options for reading refer to the volume
+        of_grids += [o.name for o in options_in(READING) if o.name not in ("order", "array")]
+    refuse(args, of_grids, "this option is for tensors on a grid; leave it out for a mesh")
+    check_boundary(args.boundary)
+    with progress.stage("reading", str(args.mesh)):
+        found = read_domain(
+            args.mesh,
+            volume_around(args, progress),
+            progress,
+            dtype=args.dtype,
+            clean=args.clean,
+            inside=args.inside,
+            array=args.array,
+            order=args.order,
+            metric=None if args.operator == "fick" else "inverse",
+            operator=args.operator,
+            interpolation=args.interpolation,
+        )
+    mesh = found.mesh
+    images, about = images_of_mesh(args.mesh, mesh, args.clean), describe_mesh(args.mesh, mesh)
+    about |= {"source": str(args.mesh), "tensors": None if args.tensors is None else str(args.tensors)}
+    return _Place(mesh, mesh, mesh.triangulation.used, images, about, partial(_draw_mesh, found))
+
+
+def _draw(volume: TensorVolume, args: argparse.Namespace, before: np.ndarray, after: np.ndarray, path: Path) -> None:
     """Draw the map, the smoothed map, and the map after isotropic smoothing of the same width, in a middle slice."""
     from hks_jax.plot import hks_panels
     from hks_jax.plot.signature import cropped, placed
@@ -95,8 +169,31 @@ def _draw(args: argparse.Namespace, volume: TensorVolume, before: np.ndarray, af
         index = int(np.median(np.flatnonzero(inside.any(axis=(0, 1)))))
         volume, values = volume.slice("z", index), values[..., index]
     grid, box = cropped(volume, np.isfinite(values[1]))
-    low, high = (float(x) for x in np.nanquantile(values[1:], [0.02, 0.98]))
-    style: dict[str, Any] = {"limits": [(low, high if high > low else low + 1)] * 3, "label": ""}
+    style: dict[str, Any] = {"limits": [_limits(values[1:])] * 3, "label": ""}
     style |= {"orientation": placed(volume, box, args.view), "path": path}
-    titles = ["map", f"along the tissue, {args.fwhm:g} mm", f"isotropic, {args.fwhm:g} mm"]
-    hks_panels(values[:, *box], [0.0] * 3, grid, titles=titles, **style)
+    hks_panels(values[:, *box], [0.0] * 3, grid, titles=_titles(args.fwhm), **style)
+
+
+def _draw_mesh(found: Domain, args: argparse.Namespace, before: np.ndarray, after: np.ndarray, path: Path) -> None:
+    """Draw the map, the smoothed map, and if there are tensors the map after smoothing without them."""
+    from hks_jax.plot.images import Colours
+    from hks_jax.plot.surfaces import surface_panels
+
+    mesh, shown, titles = found.mesh, [before, after], _titles(args.fwhm)
+    if found.tensors is None:
+        titles = [titles[0], f"smoothed, {args.fwhm:g} mm"]
+    else:
+        plain = type(mesh)(mesh.vertices, mesh.triangulation.cells, mask=np.ones(len(mesh.triangulation.cells), bool))
+        shown.append(np.asarray(smooth(plain, before, args.fwhm, args.boundary)))
+    nodes = mesh.triangulation.used if isinstance(mesh, SurfaceMesh) else mesh.triangulation.boundary_vertices
+    colours = [Colours(*_limits(np.stack(shown[1:])[:, nodes]), "viridis")] * len(shown)
+    surface_panels(mesh, shown, titles, colours, path=path)
+
+
+def _limits(values: np.ndarray) -> tuple[float, float]:
+    low, high = (float(x) for x in np.nanquantile(values, [0.02, 0.98]))
+    return low, high if high > low else low + 1
+
+
+def _titles(fwhm: float) -> list[str]:
+    return ["map", f"along the tissue, {fwhm:g} mm", f"isotropic, {fwhm:g} mm"]

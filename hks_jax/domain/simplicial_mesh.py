@@ -135,6 +135,11 @@ class SimplicialMesh(eqx.Module):
         return _induced_metric(self._edges) if given is None else spd.positive_or_nan(spd.symmetrise(given))
 
     @property
+    def metric_of_space(self) -> Float[Array, "n d d"] | None:
+        """The metric of space in the basis of `metric`, if the mesh has another metric."""
+        return None if self._metric is None else _induced_metric(self._edges)
+
+    @property
     def _edges(self) -> Float[Array, "n 3 d"]:
         """The edges v₁ − v₀, v₂ − v₀ … of each cell, as columns; NaN for inverted tetrahedra."""
         return _edges_of(self.vertices, self.triangulation.cells)

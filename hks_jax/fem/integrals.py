@@ -303,7 +303,10 @@ def assemble_mesh(
     if operator.fick:
         ratio = _mean_over_cells(space, density**2 / metric_density @ weights, density @ weights)
     # The error of P1 elements is estimated from the lengths of edges. No error estimate is known for P2 elements.
-    sampled = SampledMetric(jax.lax.stop_gradient(mesh.metric), None) if space.degree == 1 else None
+    sampled = None
+    if space.degree == 1:
+        own_metric, of_space = jax.lax.stop_gradient((mesh.metric, mesh.metric_of_space))
+        sampled = SampledMetric(own_metric, None, of_space=of_space)
     matrices = gathered(own, stiffness), gathered(own, mass)
     return assembled(*matrices, lumped, sampled, jnp.sum(volumes), ratio, own, operator, fields)
 

@@ -22,24 +22,37 @@ class SampledMetric(eqx.Module):
     spacing: Float[np.ndarray | Array, " d"] | None  # the spacing of the grid; None on a mesh
     interpolation: Interpolation = eqx.field(static=True, default="linear")
     fick: bool = eqx.field(static=True, default=False)  # whether the operator is Fick's, with D = T⁻¹
+    of_space: Float[Array, "n d d"] | None = None  # the metric of space on mesh cells that have another metric
 
 
 def mean_diffusivity(metric: SampledMetric | None, space: FunctionSpace, dtype: Any) -> Float[Array, ""]:
-    """Return the mean of trace(T⁻¹)/d over the nodes of a grid with the metric T, or 1 on a mesh or without a metric.
+    """Return the mean of trace(T⁻¹)/d over the domain with the metric T; 1 without a metric or with that of space.
 
     A plane wave with the wave number ξ has about the eigenvalue of this number times |ξ|².
     """
-    if metric is None or not isinstance(space, GridSpace):
+    if metric is None or (metric.of_space is None and not isinstance(space, GridSpace)):
         return jnp.ones((), dtype)
-    return _mean_of(jax.lax.stop_gradient(metric.tensors), mask_for(metric.tensors, space.domain)).astype(dtype)
+    tensors = jax.lax.stop_gradient(metric.tensors)
+    if metric.of_space is not None:
+        return _mean_of_cells(tensors, metric.of_space).astype(dtype)
+    return _mean_of_nodes(tensors, mask_for(tensors, space.domain)).astype(dtype)
 
 
 @numpy_where_known()
-def _mean_of(xp: Any, tensors: Any, domain: Any) -> Any:
+def _mean_of_nodes(xp: Any, tensors: Any, domain: Any) -> Any:
     d = tensors.shape[-1]
     inverse = spd.inverse(xp.where(domain[..., None, None], tensors, xp.eye(d, dtype=tensors.dtype)))
     mean = sum(inverse[..., a, a] for a in range(d)) / d
     return xp.sum(xp.where(domain, mean, 0)) / xp.sum(domain, dtype=tensors.dtype)
+
+
+# If the edges of a cell are the columns CE of an orthonormal basis E of its plane, the metric T in E has the matrix
+# g = CᵀTC in the basis of the edges, and the metric of space has G = CᵀC. So trace(T⁻¹) = trace(Cg⁻¹Cᵀ) = trace(g⁻¹G).
+@numpy_where_known()
+def _mean_of_cells(xp: Any, tensors: Any, of_space: Any) -> Any:
+    """Return the mean of trace(T⁻¹)/d, weighted by the volumes of the cells in space."""
+    trace = (spd.inverse(tensors) * of_space).sum((-2, -1))  # both matrices are symmetric
+    return _mean(xp, trace / tensors.shape[-1], xp.sqrt(spd.determinant(of_space)))
 
 
 class Resolution(eqx.Module):

@@ -1,4 +1,4 @@
-"""Read surfaces in GIFTI and FreeSurfer's format through the optional library nibabel.
+"""Read surfaces and maps in GIFTI and FreeSurfer's formats, and write maps, through the optional library nibabel.
 
 A FreeSurfer vertex with the surface coordinates v has the scanner coordinates c + ASᵀv, where c is the centre of an
 image volume, and the columns of A and S are the volume's axes in scanner coordinates and in surface coordinates
@@ -6,27 +6,34 @@ image volume, and the columns of A and S are the volume's axes in scanner coordi
 """
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from hks_jax.io.mesh_formats import Loaded
 from hks_jax.optional import optional
-from hks_jax.storage import content_of, reading
+from hks_jax.storage import atomic_path, content_of, reading
 
+MAPS = ".func.gii"
+"""The suffix of maps in GIFTI; Workbench knows the kind of the content by it."""
 _TRIANGLES = b"\xff\xff\xfe"
 """The first bytes of FreeSurfer's files of triangles."""
+_VALUES = b"\xff\xff\xff"
+"""The first bytes of FreeSurfer's files of one number for each vertex: lh.thickness, lh.curv, lh.sulc and others."""
+_GEOMETRY = ("NIFTI_INTENT_POINTSET", "NIFTI_INTENT_TRIANGLE")
 _AXES = 6
 """The largest number of axes that GIFTI allows for an array."""
 
 
-def is_freesurfer(path: Path) -> bool:
-    """Return whether a file begins with the first bytes of FreeSurfer's surfaces."""
+def is_freesurfer(path: Path, of_maps: bool = False) -> bool:
+    """Return whether a file begins with the first bytes of FreeSurfer's surfaces, or of its maps."""
     if not path.is_file():
         return False
     with open(path, "rb") as stream:
-        return stream.read(len(_TRIANGLES)) == _TRIANGLES
+        return stream.read(3) == (_VALUES if of_maps else _TRIANGLES)
 
 
 _OWN_AXES = np.array([[-1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
@@ -121,3 +128,33 @@ def _in_space(path: Path, vertices: np.ndarray, points: Any) -> np.ndarray:
         return vertices
     axes = [np.array([float(told.get(f"VolGeom{a}_{b}", "nan")) for b in "RAS"]) for a in "XYZC"]
     return _from_own_axes(path, vertices, axes)
+
+
+def load_maps(path: Path) -> list[Float[np.ndarray, "..."]] | None:
+    """Load the maps at vertices in a GIFTI file, or FreeSurfer's one map; None if the file is neither."""
+    if path.name.lower().endswith((".gii", ".gii.gz")):
+        library = optional("nibabel")
+        names = library.nifti1.intent_codes.niistring
+        with reading(path, "a readable GIFTI file"):
+            arrays = library.load(path).darrays
+            return [np.asarray(array.data) for array in arrays if names[array.intent] not in _GEOMETRY]
+    if is_freesurfer(path, of_maps=True):
+        library = optional("nibabel")
+        with reading(path, "a readable FreeSurfer map"):
+            return [np.asarray(library.freesurfer.read_morph_data(path))]
+    return None
+
+
+def write_maps(path: Path, arrays: Mapping[str, Float[np.ndarray, " V"]], record: str) -> None:
+    """Write named maps at the vertices of a surface in GIFTI, and a record of their origin in its metadata."""
+    gifti = optional("nibabel").gifti
+
+    def array_of(name: str, values: np.ndarray) -> Any:
+        meta = gifti.GiftiMetaData(Name=name)
+        kind = ("NIFTI_INTENT_NONE", "NIFTI_TYPE_FLOAT32")
+        return gifti.GiftiDataArray(np.asarray(values, np.float32), *kind, meta=meta)
+
+    arrays_of_image = [array_of(name, values) for name, values in arrays.items()]
+    image = gifti.GiftiImage(darrays=arrays_of_image, meta=gifti.GiftiMetaData(provenance=record))
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(image.to_bytes())

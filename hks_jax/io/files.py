@@ -136,10 +136,12 @@ def save(
       ``spacing`` and ``origin``, and ``mask``, ``affine``, ``slice_axis``, ``length_unit`` and ``unit`` if known. For a
       mesh, the npz also contains ``vertices``, and ``faces`` (triangles) or ``cells`` (tetrahedra).
     - ``.vtu``, ``.vtk``, ``.msh`` (Gmsh), and for triangles ``.ply``: the mesh and one array per time.
+    - ``.gii`` (``.func.gii``, ``.shape.gii``), for triangles: one array per time in single precision, without the mesh.
+      Connectome Workbench, freeview and nilearn show the arrays on the surface from which the mesh was read.
 
     Every file contains a JSON record of its origin: the version, the tensors' file with its SHA-256, order and frame,
-    the notes about its reading, and `provenance`. For a mesh, except in npz, the record is in a second file, whose path
-    is `path` with ``.json`` appended. Files are written atomically.
+    the notes about its reading, and `provenance`. For a mesh, except in npz and GIFTI, the record is in a second file,
+    whose path is `path` with ``.json`` appended. Files are written atomically.
 
     Args:
         path: the file; missing folders are created.

@@ -1,35 +1,32 @@
-"""Read maps, one or a series, at the voxels of an image or the vertices of a mesh, and write GIFTI files of them."""
+"""Read maps, one or a series, at the voxels of an image or the vertices of a mesh."""
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
+from hks_jax.io.cortex import load_maps
 from hks_jax.io.formats import IMAGES
 from hks_jax.io.masks import at_voxels, image_of
 from hks_jax.io.volume import TensorVolume
-from hks_jax.optional import optional
-from hks_jax.storage import atomic_path, existing, reading
-
-_GEOMETRY = ("NIFTI_INTENT_POINTSET", "NIFTI_INTENT_TRIANGLE")
+from hks_jax.storage import existing, reading
 
 
 def read_maps(path: str | os.PathLike[str], on: TensorVolume | SimplicialMesh) -> Float[np.ndarray, "n *shape"]:
     """Read maps for `hks_jax.decompose`: an image or a series (4D) on the voxels of `on`, or arrays at its vertices.
 
-    The formats are NIfTI, MRtrix, NRRD and ``.npy``, and for meshes GIFTI (``.func.gii``, ``.shape.gii``) and ``.npy``;
-    in ``.npy`` the maps are (*shape), or (*shape, n) for a volume and (n, V) for a mesh. If both images have affines,
-    each voxel of `on` must coincide with a voxel of the maps, and maps for a slice may cover the whole volume.
+    The formats are NIfTI, MRtrix, NRRD and ``.npy``, and for meshes GIFTI (``.func.gii``, ``.shape.gii``), FreeSurfer's
+    maps (``lh.thickness``, ``lh.curv``, …, recognised by their first bytes) and ``.npy``; in ``.npy`` the maps are
+    (*shape), or (*shape, n) for a volume and (n, V) for a mesh. If both images have affines, each voxel of `on` must
+    coincide with a voxel of the maps, and maps for a slice may cover the whole volume.
 
     Raises:
         FileNotFoundError: the file does not exist.
         ValueError: the kind of file is unknown, or the maps are on other voxels (the message has both affines), or have
             another number of vertices.
-        ImportError: nibabel (for NIfTI and GIFTI) or pynrrd (for NRRD) is missing.
+        ImportError: nibabel (for NIfTI, GIFTI and FreeSurfer's maps) or pynrrd (for NRRD) is missing.
 
     Examples:
         >>> volume = hj.io.TensorVolume(np.array(field.tensors), field.grid.spacing, field.grid.origin)
@@ -54,36 +51,16 @@ def read_maps(path: str | os.PathLike[str], on: TensorVolume | SimplicialMesh) -
 
 
 def _at_vertices(path: Path, n: int) -> Float[np.ndarray, "m V"]:
-    name = path.name.lower()
-    if name.endswith((".gii", ".gii.gz")):
-        library = optional("nibabel")
-        with reading(path, "a readable GIFTI file"):
-            arrays = [array for array in library.load(path).darrays if _intent(library, array) not in _GEOMETRY]
-            values = [np.asarray(array.data, np.float64) for array in arrays]
-    elif name.endswith(".npy"):
+    values = load_maps(path)
+    if values is None:
+        if not path.name.lower().endswith(".npy"):
+            raise ValueError(
+                f"{path}: the kind of file is unknown; expected .gii or .npy with values at the vertices, or one of "
+                "FreeSurfer's maps, such as lh.thickness"
+            )
         with reading(path, "a readable .npy file"):
             values = list(np.atleast_2d(np.load(path)))
-    else:
-        raise ValueError(f"{path}: the kind of file is unknown; expected .gii or .npy with values at the vertices")
     if not values or any(array.shape != (n,) for array in values):
         shapes = ", ".join(sorted({str(array.shape) for array in values})) or "no arrays of values"
         raise ValueError(f"{path}: got {shapes}; expected one number for each of the {n} vertices")
     return np.stack(values).astype(np.float64)
-
-
-def _intent(library: Any, array: Any) -> str:
-    return str(library.nifti1.intent_codes.niistring[array.intent])
-
-
-def write_gifti(path: Path, values: Float[np.ndarray, "m V"], names: Sequence[str]) -> Path:
-    """Write named maps at the vertices of a surface in GIFTI (``.func.gii``), which Workbench and nilearn open."""
-    gifti = optional("nibabel").gifti
-    arrays = [
-        gifti.GiftiDataArray(
-            np.asarray(one, np.float32), "NIFTI_INTENT_NONE", "NIFTI_TYPE_FLOAT32", meta=gifti.GiftiMetaData(Name=name)
-        )
-        for one, name in zip(values, names, strict=True)
-    ]
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(gifti.GiftiImage(darrays=arrays).to_bytes())
-    return path

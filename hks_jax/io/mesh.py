@@ -132,10 +132,20 @@ def is_mesh(path: Path) -> bool:
     return name.endswith(READ) or cortex.is_freesurfer(path)
 
 
+def is_surface(path: Path) -> bool:
+    """Return whether a mesh is a GIFTI or a FreeSurfer surface, to which a file of maps belongs."""
+    return path.name.lower().endswith((".gii", ".gii.gz")) or cortex.is_freesurfer(path)
+
+
 def write(path: Path, arrays: Mapping[str, Float[np.ndarray, " V"]], mesh: SimplicialMesh, record: str) -> None:
-    """Write a mesh with values at its vertices, and a record of their origin to the file ``path.json``."""
+    """Write a mesh with values at its vertices, and a record of their origin to the file ``path.json``.
+
+    A GIFTI file has the values and the record, and no mesh.
+    """
     suffix, solid = path.suffix.lower(), mesh.triangulation.dimension == 3
-    allowed = [s for s in WRITTEN if not (solid and s == ".ply")]
+    if suffix == ".gii" and not solid:
+        return cortex.write_maps(path, arrays, record)
+    allowed = [s for s in (*WRITTEN, ".gii") if not (solid and s in (".ply", ".gii"))]
     if suffix not in allowed:
         what = "values at the vertices of tetrahedra" if solid else "values at vertices"
         raise ValueError(f"path: got {str(path)!r}; {what} can be written as {', '.join(allowed)} or .npz")

@@ -131,15 +131,15 @@ class Result:
         more = {n: a for n, a in arrays.items() if n in KEPT}
         return cls(place, values, times, eigenvalues, report, more, name, str(path))
 
-    def save(self, stem: Path, image: str, origin: Mapping[str, Any] | None = None) -> None:
-        """Write the result as an npz and, if `image` is not empty, also as an image or a mesh.
+    def save(self, stem: Path, *images: str, origin: Mapping[str, Any] | None = None) -> None:
+        """Write the result as an npz and also as images or meshes.
 
         The npz contains the times, the eigenvalues, the tensors and all other arrays. If the tensors are in single
         precision, so are the written values, because further digits are not significant.
 
         Args:
             stem: the path of the files without suffix.
-            image: the suffix of the image or mesh; see `hks_jax.io.save`.
+            *images: the suffixes of the images or meshes; see `hks_jax.io.save`. Empty suffixes are ignored.
             origin: more entries of the files' provenance, in addition to the settings and the times.
         """
         single = isinstance(self.place, TensorVolume) and self.place.tensors.dtype == np.float32
@@ -150,7 +150,7 @@ class Result:
         if self.times.size:
             lengths = None if self.lengths is None else self.lengths.tolist()
             record |= {"units": self.units, "lengths": lengths}
-        for suffix in filter(None, (".npz", image)):
+        for suffix in filter(None, (".npz", *images)):
             given: dict[str, Any] = times if suffix.startswith(".nii") else extra
             if suffix == ".npz" and isinstance(self.place, TensorVolume):
                 given = {**extra, "input_tensors": self.place.tensors.astype(np.float32)}

@@ -1,7 +1,9 @@
 """Surfaces in space: meshes coloured by a scalar, and isosurfaces of a volume."""
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -12,6 +14,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, Normalize
+from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
@@ -20,8 +23,8 @@ from hks_jax.domain.components import active_elements, as_mask
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.simplicial_mesh import SurfaceMesh, TetMesh
 from hks_jax.optional import optional
-from hks_jax.plot.figure import inches
-from hks_jax.plot.images import colours_of, masked
+from hks_jax.plot.figure import finished, inches, new_figure
+from hks_jax.plot.images import Colours, colours_of, masked
 from hks_jax.plot.volumes import require_volume
 
 STRIPES = 30
@@ -110,6 +113,29 @@ def surface(
     ax.set_box_aspect(tuple(high - low), zoom=0.8 * zoom if thin.any() else zoom)  # shows a flat surface's corners
     ax.set_axis_off()
     return mappable
+
+
+def surface_panels(
+    mesh: SurfaceMesh | TetMesh,
+    values: Sequence[Real[ArrayLike, " V"]],
+    titles: Sequence[str],
+    colours: Sequence[Colours],
+    *,
+    hatched: Bool[np.ndarray, "n V"] | None = None,
+    suptitle: str = "",
+    path: Path | None = None,
+) -> Figure:
+    """Return a figure with one surface, or boundary of a solid, for each array of values, with colours of its own."""
+    columns = min(len(values), 4)
+    rows = math.ceil(len(values) / columns)
+    figure = new_figure(3.4 * columns, 3.0 * rows + 0.3 + 0.3 * suptitle.count("\n"))
+    for i, (title, one, (low, high, cmap)) in enumerate(zip(titles, values, colours, strict=True)):
+        ax: Any = figure.add_subplot(rows, columns, i + 1, projection="3d")
+        lines = None if hatched is None else hatched[i]
+        shown = surface(ax, mesh, one, vmin=low, vmax=high, cmap=cmap, hatched=lines)
+        figure.colorbar(shown, ax=ax, shrink=0.6)
+        ax.set_title(title, fontsize="medium")
+    return finished(figure, suptitle, path)
 
 
 def isosurfaces(

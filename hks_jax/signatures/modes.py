@@ -36,6 +36,7 @@ class ModeEnergies(eqx.Module):
     """The energies of maps in modes, over the domain itself (`energy`).
 
     Attributes:
+        coefficients: (…, k) the coefficients cᵢ = ∫φᵢf of `decompose`.
         eigenvalues: (k,).
         wavelength: (k,) the wavelength 2π√(D/λ) of a plane wave with the eigenvalue λ, for the mean diffusivity D, in
             the units of the domain (mm for voxels or vertices in mm); infinite for λ = 0.
@@ -48,6 +49,7 @@ class ModeEnergies(eqx.Module):
         total: (…) ∫f².
     """
 
+    coefficients: Float[Array, "*functions k"]
     eigenvalues: Float[Array, " k"]
     wavelength: Float[Array, " k"]
     fwhm: Float[Array, " k"]
@@ -93,7 +95,7 @@ def decompose(pairs: Eigenpairs, f: Any) -> Float[Array, "*functions k"]:
         >>> print((c[:1] / jnp.sqrt(2)).round(3))  # the mean of f, because ∫1 = 2
         [0.5]
     """
-    fit = fitted(pairs, f)
+    fit = _fitted(pairs, f)
     return fit.coefficients.reshape(*fit.leading, pairs.k)
 
 
@@ -130,7 +132,7 @@ def _sum(xp: Any, coefficients: Any, kept: Any, modes: Any) -> Any:
 
 @nan_is_meant
 def energy(pairs: Eigenpairs, f: Any, diffusivity: Any = None) -> ModeEnergies:
-    """Return the energies ∫(cᵢφᵢ)² of maps in the modes, their wavelengths, and the variance that the modes explain.
+    """Return the coefficients of maps and their energies ∫(cᵢφᵢ)², the modes' wavelengths, and the variance explained.
 
     The energies and the last residual add up to ∫f² (Parseval), if all nodes are measured.
 
@@ -138,8 +140,8 @@ def energy(pairs: Eigenpairs, f: Any, diffusivity: Any = None) -> ModeEnergies:
         pairs: the result of `eigenpairs`.
         f: (*shape) or (…, *shape), as in `decompose`.
         diffusivity: the D of wavelengths, for which a plane wave cos(ξ·x) has the eigenvalue D|ξ|². None means the mean
-            of trace(T⁻¹)/d over the nodes of a grid with the metric T, which for the metric D⁻¹ and for Fick's operator
-            is the mean diffusivity. On meshes, None means 1: wavelengths are in the length of the mesh's metric.
+            of trace(T⁻¹)/d over the domain with the metric T, which for the metric D⁻¹ and for Fick's operator is the
+            mean diffusivity, and is 1 for a mesh without tensors.
 
     Raises:
         ValueError: as in `decompose`, or if the diffusivity is not positive.
@@ -154,20 +156,16 @@ def energy(pairs: Eigenpairs, f: Any, diffusivity: Any = None) -> ModeEnergies:
         >>> print(jnp.isclose(found.energy.sum() + found.residual[-1], found.total))
         True
     """
-    fit = fitted(pairs, f)
+    fit = _fitted(pairs, f)
     copies, k, dtype = len(pairs.pencil.parts), pairs.k, fit.coefficients.dtype
     known = np.ones(fit.rows.shape[1:], dtype) if fit.measured is None else fit.measured.astype(dtype)
     gram = np.eye(k, dtype=dtype) if fit.gram is None else fit.gram
     found = _energies(_measure(pairs), fit.rows, known, fit.coefficients, fit.modes, gram, copies)
     energies, residual, share, total = found
-    if diffusivity is None:
-        diffusivity = mean_diffusivity(pairs.pencil.parts[0].metric, pairs.space, dtype)
-    else:
-        require_number("diffusivity", diffusivity)
-        diffusivity = jnp.asarray(diffusivity, dtype)
     return ModeEnergies(
+        fit.coefficients.reshape(*fit.leading, k),
         pairs.eigenvalues,
-        *_lengths(pairs.eigenvalues, diffusivity),
+        *lengths_of(pairs, diffusivity),
         energies.reshape(*fit.leading, k),
         residual.reshape(*fit.leading, k),
         share.reshape(*fit.leading, k),
@@ -196,6 +194,16 @@ def _energies(
     varies = variance > xp.finfo(c.dtype).eps * total
     share = xp.where(varies[:, None], 1 - residual / xp.where(varies, variance, 1)[:, None], xp.nan)
     return c * c / copies, residual, share, total
+
+
+def lengths_of(pairs: Eigenpairs, diffusivity: Any = None) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
+    """Return the wavelengths and the widths (FWHM) for which modes stand, as `energy` documents them."""
+    dtype = pairs.eigenvalues.dtype
+    if diffusivity is None:
+        diffusivity = mean_diffusivity(pairs.pencil.parts[0].metric, pairs.space, dtype)
+    else:
+        require_number("diffusivity", diffusivity)
+    return _lengths(pairs.eigenvalues, jnp.asarray(diffusivity, dtype))
 
 
 # A Gaussian of standard deviation σ multiplies a wave cos(ξ·x) by exp(−σ²|ξ|²/2), which is ½ for σ = √(2 ln2)/|ξ|. Its
@@ -264,14 +272,14 @@ def spectral_filter(
         filters = Custom(function, parameters)
     rows, leading, measured = _given(pairs, f)
     if measured is not None:
-        fit = fitted(pairs, f)
+        fit = _fitted(pairs, f)
         rows = jnp.where(jnp.all(measured), rows, matmul(fit.coefficients, fit.modes))
     shape = pairs.space.node_shape
     flow = spectral_flow(pairs, filters, pairs.space.extend(rows, outside=0.0))
     return flow.reshape(*(() if parameters is None else flow.shape[:1]), *leading, *shape)
 
 
-class Fit(NamedTuple):
+class _Fit(NamedTuple):
     """The least-squares fit of the modes to maps at the free nodes."""
 
     rows: Float[Array, "s n"]  # the maps, 0 at unmeasured nodes
@@ -314,14 +322,14 @@ def _given(
     return jnp.asarray(np.where(missing, 0, known)), leading, ~missing[0]
 
 
-def fitted(pairs: Eigenpairs, f: Any) -> Fit:
+def _fitted(pairs: Eigenpairs, f: Any) -> _Fit:
     """Return the fit of `decompose`, after its checks of the maps f."""
     rows, leading, measured = _given(pairs, f)
     copies, even = len(pairs.pencil.parts), pairs.of_part(0).kept
     measure = _measure(pairs)
     modes = _chosen(pairs.at_nodes, even)
     if measured is None and measure[1] is None:
-        return Fit(rows, leading, None, modes, _products(measure, modes, rows, None, copies), None)
+        return _Fit(rows, leading, None, modes, _products(measure, modes, rows, None, copies), None)
     gram = partial(_gram, measure, even=even, copies=copies)
     if measured is not None and is_traced(measured) and measure[1] is None:
         identity = jnp.eye(pairs.k, dtype=modes.dtype)
@@ -331,7 +339,7 @@ def fitted(pairs: Eigenpairs, f: Any) -> Fit:
     coefficients, least = _solved(inner, _products(measure, modes, rows, measured, copies))
     _tell_if_unsure(pairs.k, least, measured)
     mask = None if measured is None else jnp.asarray(measured)
-    return Fit(rows, leading, mask, modes, coefficients, inner)
+    return _Fit(rows, leading, mask, modes, coefficients, inner)
 
 
 def _measure(pairs: Eigenpairs) -> tuple[Operator, Float[Array, " n"] | None]:

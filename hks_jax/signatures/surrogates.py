@@ -12,7 +12,7 @@ from hks_jax.arrays import nan_is_meant
 from hks_jax.checks import require_count, require_real
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.linear import lapack
-from hks_jax.signatures.modes import energy, fitted, reconstruct
+from hks_jax.signatures.modes import energy, reconstruct
 from hks_jax.traced import is_traced
 
 _LACKING = 0.01
@@ -60,13 +60,13 @@ def surrogates(
         (3, 9, 9) True
     """
     require_count("n", n)
-    fit = fitted(pairs, f)
-    _tell_if_lacking(pairs, f)
+    found = energy(pairs, f)
+    _tell_if_lacking(pairs.k, jax.lax.stop_gradient(found.explained))
     labels = pairs.multiplets if groups is None else _checked_groups(groups, pairs.k)
     turns = pairs.of_part(0).kept & (pairs.eigenvalues != 0)
-    rotations = _random_rotations(key, n, jnp.asarray(labels), turns, fit.coefficients.dtype)
-    turned = jnp.einsum("nij,sj->nsi", rotations, fit.coefficients, precision="highest")
-    return reconstruct(pairs, turned.reshape(n, *fit.leading, pairs.k))
+    rotations = _random_rotations(key, n, jnp.asarray(labels), turns, pairs.eigenvalues.dtype)
+    turned = jnp.einsum("nij,...j->n...i", rotations, found.coefficients, precision="highest")
+    return reconstruct(pairs, turned)
 
 
 # The QR factorisation of a matrix of independent normal entries, with a positive diagonal of R, has a factor Q that is
@@ -94,14 +94,12 @@ def _checked_groups(groups: Any, k: int) -> Array:
     return jnp.asarray(labels.astype(int))
 
 
-def _tell_if_lacking(pairs: Eigenpairs, f: Any) -> None:
-    known = jax.lax.stop_gradient((pairs, f))
-    if is_traced(known):
+def _tell_if_lacking(k: int, explained: Float[Array, "*functions k"]) -> None:
+    if is_traced(explained):
         return
-    share = 1 - np.asarray(energy(*known).explained)[..., -1]
-    worst = float(np.nanmax(share, initial=0.0))
+    worst = float(np.max(1 - np.nan_to_num(explained, nan=1.0)[..., -1], initial=0.0))
     if worst > _LACKING:
         warn_of_accuracy(
-            f"f: {worst:.1%} of the variance lies beyond the {pairs.k} modes, and is left out of the surrogates, which "
+            f"f: {worst:.1%} of the variance lies beyond the {k} modes, and is left out of the surrogates, which "
             "are smoother than f. Use more modes"
         )

@@ -47,14 +47,16 @@ def smooth(
     Args:
         domain: a tensor field, best with ``operator="fick"``, or a mesh.
         f: (*shape), or (…, *shape) for several maps, such as a time series. Values outside the mask are not used.
-        fwhm: the full width at half maximum, in the unit of the domain's coordinates (mm for voxels in mm), at least
-            the greatest spacing of a grid. If the ratio of the tensor's eigenvalues is 3, a single voxel spreads as the
-            Gaussian up to 3 % of its greatest value for a width of 10 spacings, 6 % for 8 and 12 % for 6; the
-            covariance is right for all. For narrower widths, values may become slightly negative.
+        fwhm: the full width at half maximum, in the unit of the domain's coordinates (mm for voxels or vertices in mm),
+            at least the greatest spacing of a grid or the median edge of a mesh. On a grid, if the ratio of the
+            tensor's eigenvalues is 3, a single voxel spreads as the Gaussian up to 3 % of its greatest value for a
+            width of 10 spacings, 6 % for 8 and 12 % for 6; the covariance is right for all. For narrower widths, values
+            may become slightly negative.
         boundary: see `assemble`. Maps are smoothed within the mask only; ``"mirror"`` and ``"mean"`` reflect them,
             which is as under ``"neumann"``.
-        diffusivity: the D of the time FWHM²/(16 ln2 D). None means the mean of trace(T⁻¹)/d over the nodes of a grid
-            with the metric T, which for the metric D⁻¹ and for Fick's operator is the mean diffusivity; 1 on meshes.
+        diffusivity: the D of the time FWHM²/(16 ln2 D). None means the mean of trace(T⁻¹)/d over the domain with the
+            metric T, which for the metric D⁻¹ and for Fick's operator is the mean diffusivity (on a surface that of the
+            tensors' tangential parts), and is 1 for a mesh without tensors.
 
     Raises:
         ValueError: if f has another shape or is not finite inside the mask, if the FWHM is below the spacing, or if the
@@ -74,10 +76,10 @@ def smooth(
             "a concrete domain and FWHM. Otherwise use `heat_flow` with eigenpairs"
         )
     require_number("fwhm", fwhm)
-    if isinstance(domain, TensorField) and fwhm < max(domain.grid.spacing):
+    what, least = _least_width(domain)
+    if fwhm < least:
         raise ValueError(
-            f"fwhm: got {fwhm:g} on a grid with the spacing {max(domain.grid.spacing):g}, which does not resolve it; "
-            "expected at least the spacing"
+            f"fwhm: got {fwhm:g} on a {what} {least:.4g}, which does not resolve it; expected at least this length"
         )
     with jax.ensure_compile_time_eval():  # only the maps may be traced
         pencil = assemble(domain, boundary, "lumped").parts[0]
@@ -100,6 +102,14 @@ def smooth(
     degree = least_degree(time * top / 2, max(_OMITTED, float(jnp.finfo(dtype).eps)))
     smoothed = _flow(degree, pencil, jnp.asarray(top, dtype), jnp.asarray(time, dtype), rows)
     return space.extend(smoothed).reshape(u.shape)
+
+
+def _least_width(domain: TensorField | SimplicialMesh) -> tuple[str, float]:
+    """Return the spacing of a grid, or the median edge of a mesh, with its name."""
+    if isinstance(domain, TensorField):
+        return "grid with the spacing", max(domain.grid.spacing)
+    ends = np.asarray(domain.vertices, np.float64)[domain.triangulation.edges]
+    return "mesh with the median edge", float(np.median(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)))
 
 
 @jax.jit

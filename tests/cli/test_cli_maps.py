@@ -7,6 +7,7 @@ import re
 import nibabel as nib
 import numpy as np
 import pytest
+from fields import random_spd
 
 import hks_jax as hj
 from hks_jax.cli import main
@@ -158,6 +159,99 @@ def test_maps_that_are_refused(tensors, series, tmp_path, capsys):
     assert "modes.npy: this input file would be replaced by the output" in capsys.readouterr().err
 
 
+def test_a_surface_in_gives_a_surface_out(tmp_path, capsys):
+    """FreeSurfer's surface and map in; values in GIFTI out, in the order of the vertices, with their times."""
+    mesh = surface(tmp_path / "s.surf.gii")
+    vertices = np.asarray(mesh.vertices)
+    nib.freesurfer.write_geometry(str(tmp_path / "lh.white"), vertices, mesh.faces)
+    thickness = 2 + vertices[:, 0] + 0.3 * vertices[:, 1] ** 2
+    nib.freesurfer.write_morph_data(str(tmp_path / "lh.thickness"), thickness)
+    folder, white = tmp_path / "out", str(tmp_path / "lh.white")
+    assert main(["hks", white, "-o", str(folder), "-k", "9", "--times", "0.5", "1", "-q"]) == 0
+    image = nib.load(folder / "hks.func.gii")
+    with np.load(folder / "hks.npz") as found:
+        np.testing.assert_allclose([array.data for array in image.darrays], found["hks"], rtol=1e-6)
+    assert [array.meta["Name"] for array in image.darrays] == ["hks_0_t0.5", "hks_1_t1"]
+    assert {array.data.dtype for array in image.darrays} == {np.dtype("float32")}
+    assert json.loads(image.meta["provenance"])["settings"]["k"] == 9
+    assert hj.io.read_mesh(folder / "hks.vtu").faces.shape == mesh.faces.shape
+    read = hj.io.read_maps(tmp_path / "lh.thickness", mesh)
+    np.testing.assert_allclose(read, thickness[None], rtol=1e-6)
+    # Cleaning may number the vertices anew, and other formats have values themselves.
+    assert main(["hks", white, "-o", str(folder), "-k", "9", "--times", "0.5", "-q", "--clean"]) == 0
+    assert not (folder / "hks.func.gii").exists()
+    np.save(tmp_path / "lh.npy", thickness)
+    told = ["lh.npy", "lh.thickness"]
+    projected = []
+    for name in told:
+        assert main(["modes", white, "-o", str(folder), "-k", "9", "--map", str(tmp_path / name), "-q"]) == 0
+        projected.append(nib.load(folder / "reconstruction.func.gii").darrays[0].data)
+    np.testing.assert_allclose(*projected, rtol=1e-5)
+    content = (tmp_path / "lh.thickness").read_bytes()
+    (tmp_path / "lh.thickness").write_bytes(content[:-8])
+    assert main(["modes", white, "-o", str(folder), "-k", "9", "--map", str(tmp_path / "lh.thickness"), "-q"]) == 2
+    assert "expected one number for each of the 42 vertices" in capsys.readouterr().err
+
+
+def smoothed_on(path, mesh, f, *more):
+    """Return the map that the command smooths, from the npz and from the image."""
+    np.save(path / "f.npy", f)
+    out = path / "out"
+    options = ["--mesh", str(mesh), "--fwhm", "0.8", "-o", str(out), "-q", *more]
+    assert main(["smooth", str(path / "f.npy"), *options]) == 0
+    assert (out / "smoothed.png").stat().st_size > 5000
+    with np.load(out / "smoothed.npz") as found:
+        return found["smoothed"]
+
+
+def test_maps_are_smoothed_on_a_surface(tmp_path, rng, capsys):
+    mesh = surface(tmp_path / "s.surf.gii")
+    vertices = np.asarray(mesh.vertices).astype(np.float32).astype(np.float64)
+    inside = vertices[:, 2] > -0.4
+    np.save(tmp_path / "inside.npy", inside)
+    f = rng.standard_normal((2, 42))
+    found = smoothed_on(tmp_path, tmp_path / "s.surf.gii", f, "--inside", str(tmp_path / "inside.npy"))
+    cap = hj.SurfaceMesh(vertices, mesh.faces, mask=inside)
+    np.testing.assert_allclose(found, hj.smooth(cap, f, 0.8), atol=1e-12)
+    maps = np.stack([array.data for array in nib.load(tmp_path / "out" / "smoothed.func.gii").darrays])
+    np.testing.assert_allclose(maps, found, atol=1e-6)
+    again = ["smooth", str(tmp_path / "f.npy"), "--fwhm", "0.8", "-o", str(tmp_path / "out"), "-q"]
+    calls = {
+        "--tensors: got no file; expected the diffusion tensors": [],
+        "--boundary: got 'periodic'; expected neumann, dirichlet, mean": ["--boundary", "periodic"],
+        "--slice: this option is for tensors on a grid": ["--slice", "z=1"],
+        "--frame: this option is for tensors on a grid": ["--frame", "voxel"],
+        "--array: got 'D'; expected one of the arrays": ["--array", "D"],
+    }
+    for message, options in calls.items():
+        on = ["--mesh", str(tmp_path / "s.surf.gii")] * bool(options)
+        assert main([*again, *on, *options]) == 2
+        assert message in capsys.readouterr().err
+    f[1, 7] = np.nan
+    np.save(tmp_path / "f.npy", f)
+    assert main([*again, "--mesh", str(tmp_path / "s.surf.gii")]) == 2
+    assert "NaN or infinite values at 1 vertices inside the mask" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("boundary", ["neumann", "dirichlet"])
+def test_maps_are_smoothed_by_tensors_on_tetrahedra(boundary, tmp_path, rng):
+    import meshio
+
+    ball = hj.examples.ball_mesh(2)
+    D = 1e-3 * random_spd(rng, (len(ball.vertices), 1, 1))[:, 0, 0]
+    whole = meshio.Mesh(np.asarray(ball.vertices), [("tetra", ball.cells)], point_data={"D": D.reshape(-1, 9)})
+    meshio.write(tmp_path / "heart.vtu", whole)
+    f = rng.standard_normal(len(ball.vertices))
+    for operator, settings in (("fick", {"operator": "fick"}), ("laplace-beltrami", {"metric": "inverse"})):
+        more = ["--array", "D", "--operator", operator, "--boundary", boundary]
+        found = smoothed_on(tmp_path, tmp_path / "heart.vtu", f, *more)
+        mesh = hj.TetMesh.from_tensors(ball.vertices, ball.cells, D, **settings)
+        np.testing.assert_allclose(found, hj.smooth(mesh, f, 0.8, boundary), atol=1e-10)
+        written = hj.io.read_mesh_arrays(tmp_path / "out" / "smoothed.vtu")["smoothed"]
+        np.testing.assert_allclose(written, found, atol=1e-6)
+
+
 @pytest.mark.slow
 def test_maps_are_smoothed_as_by_the_library(tensors, tmp_path, capsys):
     f = np.random.default_rng(1).normal(size=(*SHAPE, 2))
@@ -165,11 +259,13 @@ def test_maps_are_smoothed_as_by_the_library(tensors, tmp_path, capsys):
     out, name = tmp_path / "out", str(tmp_path / "bold.nii.gz")
     volume = hj.io.read_tensors(tensors).with_mask(MASK)
     command = ["smooth", name, "--tensors", tensors, "-o", str(out), "-q"]
-    for operator, settings in (("fick", {"operator": "fick"}), ("laplace-beltrami", {"metric": "inverse"})):
-        assert main([*command, "--fwhm", "6", "--operator", operator]) == 0
+    fick, beltrami, rim = {"operator": "fick"}, {"metric": "inverse"}, "dirichlet-rim"
+    for settings, boundary in ((fick, "neumann"), (beltrami, "neumann"), (fick, rim)):
+        operator = settings.get("operator", "laplace-beltrami")
+        assert main([*command, "--fwhm", "6", "--operator", operator, "--boundary", boundary]) == 0
         found = np.moveaxis(nib.load(out / "smoothed.nii.gz").get_fdata(), -1, 0)
         field = hj.TensorField.from_diffusion(volume.grid("all"), volume.tensors, **settings)
-        np.testing.assert_allclose(found, hj.smooth(field, np.moveaxis(f, -1, 0), 6.0), atol=1e-5)
+        np.testing.assert_allclose(found, hj.smooth(field, np.moveaxis(f, -1, 0), 6.0, boundary), atol=1e-5)
         assert (out / "smoothed.png").stat().st_size > 5000
     assert main([*command, "--fwhm", "2"]) == 2
     assert "--fwhm: got 2 on a grid with the spacing 3, which does not resolve it" in capsys.readouterr().err

@@ -110,7 +110,8 @@ def test_energies_and_residuals_add_up(name, rng):
     f = np.nan_to_num(maps(pairs, rng))
     found = hj.energy(pairs, f)
     np.testing.assert_allclose(found.total, inner(pairs, f, f))
-    c = np.asarray(hj.decompose(pairs, f))
+    c = np.asarray(found.coefficients)
+    np.testing.assert_array_equal(c, hj.decompose(pairs, f))
     for m in (1, 4, pairs.k):
         left = f - np.nan_to_num(hj.reconstruct(pairs, c[:, :m]))
         np.testing.assert_allclose(found.residual[:, m - 1], inner(pairs, left, left), rtol=1e-10)
@@ -209,8 +210,10 @@ def test_maps_that_cannot_be_decomposed(rng):
         hj.decompose(pairs, few)
     assert np.isnan(jax.jit(hj.decompose)(pairs, few)).all()
     half = np.where(np.arange(42).reshape(SHAPE) % 6 < 3, 1.0, np.nan)
-    with pytest.warns(hj.AccuracyWarning, match="amplifies errors of f by up to"):
-        hj.decompose(pairs, half)
+    for call in (hj.decompose, hj.energy, lambda p, f: hj.surrogates(p, f, jax.random.key(0))):
+        with pytest.warns(hj.AccuracyWarning, match="amplifies errors of f by up to") as said:
+            call(pairs, half)
+        assert sum("amplifies" in str(one.message) for one in said) == 1
     with pytest.raises(ValueError, match=r"c: got shape \(10,\); expected .* 1 to 9"):
         hj.reconstruct(pairs, np.ones(10))
     with pytest.raises(ValueError, match="parameters: got arrays of shapes"):
@@ -239,6 +242,35 @@ def test_the_energy_of_a_plane_wave_is_at_its_wavelength_in_mm(diffusivity):
         np.testing.assert_allclose(half, 0.5, rtol=1e-9)
     given = hj.energy(pairs, f, diffusivity=4 * diffusivity)
     np.testing.assert_allclose(given.wavelength[1:], 2 * found.wavelength[1:])
+
+
+@pytest.mark.parametrize("solid", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_wavelengths_on_meshes_are_in_mm_whatever_the_tensors(solid):
+    """The first wave along a bar of 24 mm has a wavelength of 48 mm; a tensor across a surface does not matter."""
+    domain = bar(solid)
+    x = np.asarray(domain.vertices)[:, 0]
+    D = 0.7e-3 * np.diag([1.0, 1.0, 1.0 if solid else 50.0])
+    for operator in ({"operator": "fick"}, {"metric": "inverse"}):
+        made = type(domain).from_tensors(
+            domain.vertices, domain.triangulation.cells, np.tile(D, (len(x), 1, 1)), **operator
+        )
+        found = hj.energy(hj.eigenpairs(made, 5, multiplet="drop"), np.cos(np.pi * x / 24))
+        assert found.energy.argmax() == 1
+        assert float(found.wavelength[1]) == pytest.approx(48, rel=0.02)
+
+
+def bar(solid):
+    """A bar of 24 × 6 (× 2) mm, of triangles or of tetrahedra."""
+    n = (13, 4, 2) if solid else (13, 4, 1)
+    places = np.stack(np.meshgrid(*(2.0 * np.arange(m) for m in n), indexing="ij"), -1).reshape(-1, 3)
+    number = np.arange(len(places)).reshape(n)
+    corner = [number[i : i + n[0] - 1, j : j + n[1] - 1].reshape(-1, n[2]) for i, j in np.ndindex(2, 2)]
+    if not solid:
+        a, b, c, d = (each[:, 0] for each in corner)
+        return hj.SurfaceMesh(places, np.concatenate([np.stack([a, c, d], 1), np.stack([a, d, b], 1)]))
+    cube = [corner[i][:, j] for i in range(4) for j in range(2)]  # the corner (i, j, k) has the number 4i + 2j + k
+    paths = [(0, 4, 6, 7), (0, 6, 2, 7), (0, 2, 3, 7), (0, 3, 1, 7), (0, 1, 5, 7), (0, 5, 4, 7)]
+    return hj.TetMesh(places, np.concatenate([np.stack([cube[i] for i in path], 1) for path in paths]))
 
 
 def test_constants_have_no_variance():

@@ -61,6 +61,47 @@ def test_the_flow_of_all_eigenpairs_and_the_total(boundary, rng):
         np.testing.assert_allclose(after, before, rtol=1e-8, atol=1e-9)
 
 
+def cap():
+    """A part of a sphere."""
+    whole = hj.examples.sphere_mesh(2)
+    vertices = np.asarray(whole.vertices)
+    return hj.SurfaceMesh, vertices, whole.faces, vertices[:, 2] > -0.4
+
+
+def ball():
+    whole = hj.examples.ball_mesh(2)
+    return hj.TetMesh, np.asarray(whole.vertices), whole.cells, None
+
+
+@pytest.mark.parametrize(
+    ("made", "boundary"),
+    [(cap, "neumann"), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((cap, "mean"), (ball, "dirichlet")))],
+)
+def test_the_flow_of_all_eigenpairs_of_a_mesh_and_the_total(made, boundary, rng):
+    """The tensors are those of space; on a surface, their tangential parts have the mean diffusivity."""
+    kind, vertices, cells, mask = made()
+    D = 1e-3 * random_spd(rng, (len(vertices), 1, 1))[:, 0, 0]
+    mesh = kind.from_tensors(vertices, cells, D, operator="fick", mask=mask)
+    f, used = rng.standard_normal((2, len(vertices))), mesh.triangulation.used
+    f[:, ~used] = np.nan
+    found = np.asarray(hj.smooth(mesh, f, 0.9, boundary))
+    plain = boundary if boundary == "dirichlet" else "neumann"
+    pencil = hj.assemble(mesh, plain, "lumped")
+    pairs = hj.eigenpairs(pencil, pencil.size, solver="dense")
+    corners = vertices[mesh.triangulation.cells]
+    edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+    frames, of_edges = np.linalg.qr(edges)
+    sizes = np.abs(np.prod(np.diagonal(of_edges, axis1=1, axis2=2), axis=1))
+    tangential = np.einsum("nxa,nxy,nya->n", frames, D[mesh.triangulation.cells].mean(axis=1), frames)
+    mean = np.average(tangential / edges.shape[2], weights=sizes)
+    expected = hj.heat_flow(pairs, [0.81 / (16 * np.log(2) * mean)], f)[0]
+    np.testing.assert_allclose(found, expected, atol=1e-8)
+    if plain == "neumann":
+        weights = np.asarray(pencil.space.extend(pencil.mass.diagonal(), outside=0.0))
+        before, after = (np.sum(weights * np.where(used, x, 0), axis=1) for x in (f, found))
+        np.testing.assert_allclose(after, before, rtol=1e-8, atol=1e-9)
+
+
 @pytest.mark.slow
 def test_on_meshes_in_single_precision_and_derivatives(rng):
     mesh = hj.examples.sphere_mesh(4)
@@ -94,5 +135,9 @@ def test_smoothing_that_is_refused():
         hj.smooth(field, np.nan * f, 6.0)
     with pytest.raises(ValueError, match=r"fwhm: got -1.0; expected a finite number above 0"):
         hj.smooth(field, f, -1.0)
+    with pytest.raises(
+        ValueError, match=r"fwhm: got 0.1 on a mesh with the median edge 0.5823, which does not resolve"
+    ):
+        hj.smooth(hj.examples.sphere_mesh(2), np.ones(42), 0.1)
     with pytest.raises(ValueError, match="domain: got traced values"):
         jax.jit(lambda T: hj.smooth(hj.TensorField(field.grid, T), f, 6.0))(field.tensors)
