@@ -25,6 +25,7 @@ examples:
 import argparse
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -55,6 +56,7 @@ OPTIONS = f"""
     a map or a series of maps (4D): NIfTI, MRtrix, NRRD or .npy on the voxels of FILE; for a mesh GIFTI, FreeSurfer's
     maps (lh.thickness, lh.curv, …) or .npy, one value per vertex. NaN marks unmeasured voxels or vertices: the modes
     are fitted to the others by least squares. Zeros are values. Values outside the mask are not used
+@view
 """
 
 TABLES = ("modes.tsv", "modes.json", "coefficients.tsv", "energies.tsv")
@@ -90,8 +92,16 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         functions = np.asarray(pairs.eigenfunctions)
         wavelength, fwhm = (np.asarray(lengths) for lengths in lengths_of(pairs))
         known = {"eigenvalue": np.asarray(pairs.eigenvalues), "wavelength": wavelength, "fwhm": fwhm}
-        found = None if maps is None else energy(pairs, maps)
-        projected = None if found is None else np.asarray(reconstruct(pairs, found.coefficients))
+        counts, shown, means = [], {}, {}
+        if maps is not None:
+            found = energy(pairs, maps)
+            means, coefficients = _means(found), np.asarray(found.coefficients)
+            projected = np.asarray(reconstruct(pairs, coefficients))
+            counts = sorted({max(1, round(pairs.k**power)) for power in (1 / 3, 2 / 3, 1)})
+            for n in counts:
+                title = f"{n} modes: {float(found.explained[0, n - 1]):.0%}"
+                shown[title] = np.asarray(reconstruct(pairs, coefficients[0, :n]))
+            shown[args.map.name] = np.where(np.isfinite(functions[0]), maps[0], np.nan)
     report = {
         "input": solved.about,
         "settings": {name: asdict(solved.settings)[name] for name in _SETTINGS} | {"k": pairs.k},
@@ -99,16 +109,17 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         "units": {"length": getattr(place, "length_unit", "") or None},
         "map": None if maps is None else {"source": str(args.map), "maps": len(maps)},
     }
-    with writing(args.output, report, progress, lambda: _stale(args)) as (folder, done):
+    style = {"wavelength": wavelength, "unit": getattr(place, "length_unit", ""), "view": args.view, **means}
+    style |= {"counts": counts, "maps": shown}
+    pictures = {"modes.png": partial(_draw, place, functions, style)}
+    with writing(args.output, report, progress, lambda: _stale(args), pictures) as (folder, done):
         _write(folder, "modes", functions, solved, {"eigenvalues": np.asarray(pairs.eigenvalues)})
         _tabulate(folder / "modes.tsv", known)
         write_json(folder / "modes.json", _sidecar(solved, known))
-        if found is not None:
-            assert projected is not None
+        if maps is not None:
             _write(folder, "reconstruction", projected, solved, {})
-            _tabulate(folder / "energies.tsv", known | _means(found))
-            columns = {f"map_{i + 1}": column for i, column in enumerate(np.asarray(found.coefficients))}
-            _tabulate(folder / "coefficients.tsv", columns)
+            _tabulate(folder / "energies.tsv", known | means)
+            _tabulate(folder / "coefficients.tsv", {f"map_{i + 1}": column for i, column in enumerate(coefficients)})
     return done
 
 
@@ -143,6 +154,12 @@ def _means(found: ModeEnergies) -> dict[str, np.ndarray]:
     varies = np.isfinite(explained).all(axis=1)
     share = explained[varies].mean(axis=0) if varies.any() else np.full(explained.shape[1], np.nan)
     return {"energy": np.asarray(found.energy).mean(axis=0), "explained": share}
+
+
+def _draw(place: TensorVolume | SimplicialMesh, modes: np.ndarray, style: Mapping[str, Any], path: Path) -> None:
+    from hks_jax.plot.modes import modes_panels
+
+    modes_panels(place, modes, path=path, **style)
 
 
 def _tabulate(path: Path, columns: Mapping[str, np.ndarray]) -> None:

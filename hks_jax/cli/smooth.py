@@ -158,16 +158,15 @@ def _on_mesh(args: argparse.Namespace, progress: Progress) -> _Place:
 def _draw(volume: TensorVolume, args: argparse.Namespace, before: np.ndarray, after: np.ndarray, path: Path) -> None:
     """Draw the map, the smoothed map, and the map after isotropic smoothing of the same width, in a middle slice."""
     from hks_jax.plot import hks_panels
-    from hks_jax.plot.signature import cropped, placed
+    from hks_jax.plot.signature import cropped, middle_slice, placed
 
     field = TensorField(volume.grid("all"), np.broadcast_to(np.eye(volume.dimension), volume.tensors.shape))
     time = args.fwhm**2 / (16 * math.log(2.0))
     inside = field.grid.inside
     isotropic = gaussian_scale_space(field, [time], np.where(inside, before, 0))[0]
     values = np.stack([np.where(inside, before, np.nan), after, isotropic])
-    if volume.dimension == 3:
-        index = int(np.median(np.flatnonzero(inside.any(axis=(0, 1)))))
-        volume, values = volume.slice("z", index), values[..., index]
+    volume, cut = middle_slice(volume, inside)
+    values = cut(values)
     grid, box = cropped(volume, np.isfinite(values[1]))
     style: dict[str, Any] = {"limits": [_limits(values[1:])] * 3, "label": ""}
     style |= {"orientation": placed(volume, box, args.view), "path": path}

@@ -1,7 +1,7 @@
 """The figure of a result: its signature over t, cropped to the domain and oriented in space."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -147,6 +147,19 @@ def nodes_for_colours(result: Result, nodes: Bool[np.ndarray, "*shape"]) -> list
     near = result.near_rim
     free = [nodes if near is None else nodes & ~near[i] for i in range(len(result.values))]
     return [one if one.sum() > ENOUGH * nodes.sum() else nodes for one in free]
+
+
+def middle_slice(
+    volume: TensorVolume, inside: Bool[np.ndarray, "*shape"]
+) -> tuple[TensorVolume, Callable[[np.ndarray], np.ndarray]]:
+    """Return the slice of a volume across z in the middle of the domain, and the function that cuts (…, *shape) arrays.
+
+    A slice stays.
+    """
+    if volume.dimension == 2:
+        return volume, lambda values: values
+    index = int(np.median(np.flatnonzero(inside.any(axis=(0, 1)))))
+    return volume.slice("z", index), lambda values: values[..., index]
 
 
 def cropped(volume: TensorVolume | Grid, inside: Bool[np.ndarray, "*shape"]) -> tuple[Grid, tuple[slice, ...]]:

@@ -56,6 +56,7 @@ def test_modes_and_coefficients_of_a_series_are_those_of_the_library(tensors, se
     assert main(["modes", tensors, "-o", str(out), "--operator", "fick", "-k", "12", "--map", name, "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["settings"]["boundary"] == "neumann"
+    assert (out / "modes.png").stat().st_size > 5000
     volume = hj.io.read_tensors(tensors)
     volume = volume.with_mask(MASK)
     field = hj.TensorField.from_diffusion(volume.grid("all"), volume.tensors, operator="fick")
@@ -121,6 +122,7 @@ def test_surfaces_and_tetrahedra(tmp_path, capsys):
     arrays = hj.io.read_mesh_arrays(tmp_path / "three" / "modes.vtu")
     assert len(arrays) == 5
     assert not (tmp_path / "three" / "modes.func.gii").exists()
+    assert all((tmp_path / folder / "modes.png").stat().st_size > 5000 for folder in ("out", "two", "three"))
 
 
 def test_maps_that_are_refused(tensors, series, tmp_path, capsys):

@@ -252,7 +252,7 @@ def test_bad_meshes(tmp_path, capsys):
     with pytest.raises(ValueError, match="kind of mesh is unknown"):
         read_mesh(tmp_path / "m.gts")
     mesh = hj.SurfaceMesh(vertices, faces)
-    with pytest.raises(ValueError, match=r"can be written as \.vtu, \.vtk, \.msh, \.ply or \.npz"):
+    with pytest.raises(ValueError, match=r"can be written as \.vtu, \.vtk, \.msh, \.ply, \.gii or \.npz"):
         save(tmp_path / "v.stl", np.zeros(6), mesh)
     with pytest.raises(ValueError, match=r"expected \(6,\), or \(n_times, \*shape\)"):
         save(tmp_path / "v.ply", np.zeros(7), mesh)

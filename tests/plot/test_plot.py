@@ -8,7 +8,7 @@ from annotations import unchecked
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from hks_jax import Grid, SurfaceMesh, TensorField
-from hks_jax.domain.examples import ball_mesh
+from hks_jax.domain.examples import ball_mesh, sphere_mesh
 from hks_jax.io import Result, TensorVolume
 from hks_jax.plot import (
     ellipses,
@@ -26,6 +26,7 @@ from hks_jax.plot import (
     trace,
 )
 from hks_jax.plot.glyphs import FILL
+from hks_jax.plot.modes import modes_panels
 from hks_jax.plot.signature import away_from_rim, bounding_box
 
 
@@ -528,3 +529,31 @@ def test_a_curve_of_one_time_is_a_mark():
     assert line.get_marker() == "o"
     with pytest.raises(ValueError, match="labels: got 2 labels; expected 1"):
         hks_curves(ax, np.ones((1, 3, 3)), [0.5], grid, [(1, 1)], labels=["A", "B"])
+
+
+@pytest.mark.parametrize("mesh", [False, True])
+def test_the_figure_of_modes(mesh):
+    """The energies are drawn at their wavelengths, without that of the mean, and a map has the colours of the whole."""
+    if mesh:
+        place = sphere_mesh(2)
+        modes = np.random.default_rng(0).normal(size=(9, len(place.vertices)))
+    else:
+        inside = np.hypot(*(np.indices((14, 12)) - 6.0)) < 5.5
+        place = TensorVolume(np.tile(np.eye(2), (14, 12, 1, 1)), (2.0, 2.0), (0.0, 0.0), mask=inside)
+        modes = np.where(inside, np.random.default_rng(0).normal(size=(9, 14, 12)), np.nan)
+    wavelength = np.array([np.inf, 40, 40, 30, 25, 20, 18, 16, 15.0])
+    energy, explained = 10.0 ** (-0.9 * np.arange(9)), np.linspace(0, 0.8, 9)
+    style = {"energy": energy, "explained": explained, "counts": [2, 9], "unit": "mm"}
+    figure = modes_panels(place, modes, wavelength, maps={"2 modes": modes[0], "map": modes[1]}, **style)
+    energies, shares, *panels = [ax for ax in figure.axes if ax.get_title() or ax.get_xlabel()]
+    (dots,) = energies.get_lines()
+    np.testing.assert_allclose(dots.get_xdata(), wavelength[1:8])  # without the mean, and energies below 1e-6
+    np.testing.assert_allclose(dots.get_ydata(), energy[1:8])
+    assert energies.get_xlabel() == "wavelength in mm"
+    np.testing.assert_allclose(shares.get_lines()[1].get_xydata(), [[2, 0.1], [9, 0.8]])
+    titles = ["mode 2: 40 mm", "mode 3: 40 mm", "mode 5: 25 mm", "mode 9: 15 mm", "2 modes", "map"]
+    assert [ax.get_title() for ax in panels] == titles
+    if not mesh:
+        first, second = (ax.get_images()[0].get_clim() for ax in panels[-2:])
+        assert first == second == pytest.approx(np.nanquantile(modes[1], [0.01, 0.99]))
+    assert len(modes_panels(place, modes, np.full(9, np.inf)).axes) == 0
