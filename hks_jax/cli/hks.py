@@ -110,7 +110,8 @@ def _on_mesh(args: argparse.Namespace, settings: Settings, progress: Progress) -
     else:
         result = with_error_bars(args, of_pairs, noisy, pairs, settings, progress)
     drawing = partial(_draw_mesh, result, args.show_rim)
-    return write_outputs(args.output, result, progress, drawing, *images_of_mesh(args.file, mesh, args.clean))
+    images, origin = images_of_mesh(args.file, mesh, args.clean)
+    return write_outputs(args.output, result, progress, drawing, *images, origin=origin)
 
 
 def _noise_on(domain: Domain, args: argparse.Namespace, progress: Progress) -> Noisy | None:

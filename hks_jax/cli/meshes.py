@@ -20,7 +20,7 @@ from hks_jax.domain.tensor_checks import Interpolation, MetricChoice, OperatorCh
 from hks_jax.fem.assembly import MESH_BOUNDARIES
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.io import TensorVolume, read_mask, read_mesh, sample_tensors
-from hks_jax.io.cortex import MAPS
+from hks_jax.io.cortex import MAPS, structure_of
 from hks_jax.io.mesh import WRITTEN, arrays_by_place, is_surface
 from hks_jax.io.repair import require_valid
 from hks_jax.io.tensor_order import Order, matrices
@@ -95,15 +95,15 @@ def solve_mesh(mesh: Mesh, settings: Settings, progress: Progress) -> tuple[Eige
     return solve(pencil, settings, progress), settings
 
 
-def images_of_mesh(file: Path, mesh: Mesh, clean: bool) -> tuple[str, ...]:
-    """Return the suffixes of results on a mesh.
+def images_of_mesh(file: Path, mesh: Mesh, clean: bool) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Return the suffixes of results on a mesh, and entries for their provenance.
 
-    They are the suffix of the mesh's file, or .vtu if its format has no values at vertices; and for a GIFTI or a
+    The suffixes are that of the mesh's file, or .vtu if its format has no values at vertices; and for a GIFTI or a
     FreeSurfer surface also that of GIFTI's maps, unless the vertices may have been renumbered by cleaning.
     """
     suffix = file.suffix.lower()
     own = ".vtu" if suffix not in WRITTEN or (suffix == ".ply" and isinstance(mesh, TetMesh)) else suffix
-    return (own, MAPS) if is_surface(file) and not clean else (own,)
+    return ((own, MAPS), structure_of(file)) if is_surface(file) and not clean else ((own,), {})
 
 
 def _check_options(args: argparse.Namespace) -> None:

@@ -45,7 +45,7 @@ from hks_jax.io import TensorVolume, read_maps, save
 from hks_jax.io.cortex import MAPS
 from hks_jax.io.formats import WRITTEN, format_of
 from hks_jax.io.mesh import WRITTEN as MESHES_WRITTEN
-from hks_jax.io.mesh import is_mesh
+from hks_jax.io.mesh import is_mesh, is_surface
 from hks_jax.io.tables import write_json, write_table
 from hks_jax.signatures.modes import lengths_of
 
@@ -67,6 +67,8 @@ class _Solved(NamedTuple):
     pairs: Eigenpairs
     settings: Settings
     images: tuple[str, ...]  # the suffixes of images
+    origin: dict[str, str]  # entries of their provenance
+    unit: str  # of lengths; empty if it is not known
     about: dict[str, Any]  # the entries of the report about the input
 
 
@@ -106,10 +108,10 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         "input": solved.about,
         "settings": {name: asdict(solved.settings)[name] for name in _SETTINGS} | {"k": pairs.k},
         "eigenpairs": describe_pairs(pairs),
-        "units": {"length": getattr(place, "length_unit", "") or None},
+        "units": {"length": solved.unit or None},
         "map": None if maps is None else {"source": str(args.map), "maps": len(maps)},
     }
-    style = {"wavelength": wavelength, "unit": getattr(place, "length_unit", ""), "view": args.view, **means}
+    style = {"wavelength": wavelength, "unit": solved.unit, "view": args.view, **means}
     style |= {"counts": counts, "maps": shown}
     pictures = {"modes.png": partial(_draw, place, functions, style)}
     with writing(args.output, report, progress, lambda: _stale(args), pictures) as (folder, done):
@@ -138,14 +140,16 @@ def _on_grid(args: argparse.Namespace, progress: Progress) -> _Solved:
         require_metric(args)
         volume, image = read_volume(args, progress), format_of(args.file).image
         solved = compute_pairs(volume, settings, progress)
-    return _Solved(solved.volume, solved.pairs, solved.settings, (image,), describe_input(solved.volume))
+    volume = solved.volume
+    return _Solved(volume, solved.pairs, solved.settings, (image,), {}, volume.length_unit, describe_input(volume))
 
 
 def _on_mesh(args: argparse.Namespace, progress: Progress) -> _Solved:
     mesh = domain_of(args, progress).mesh
     pairs, settings = solve_mesh(mesh, Settings.of(args, metric=args.metric), progress)
     about = {"source": str(args.file), **describe_mesh(args.file, mesh)}
-    return _Solved(mesh, pairs, settings, images_of_mesh(args.file, mesh, args.clean), about)
+    images, origin = images_of_mesh(args.file, mesh, args.clean)
+    return _Solved(mesh, pairs, settings, images, origin, "mm" * is_surface(args.file), about)
 
 
 def _means(found: ModeEnergies) -> dict[str, np.ndarray]:
@@ -170,14 +174,13 @@ def _tabulate(path: Path, columns: Mapping[str, np.ndarray]) -> None:
 def _sidecar(solved: _Solved, known: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """Return the sidecar of the modes; an infinite length, of the eigenvalue 0, becomes null."""
     lengths = {name: [x if np.isfinite(x) else None for x in known[name].tolist()] for name in ("wavelength", "fwhm")}
-    unit = getattr(solved.place, "length_unit", "")
     return {
         "Quantity": "modes",
         "Description": "Eigenfunctions, orthonormal in the inner product of the mass matrix, in ascending order",
         "Eigenvalues": known["eigenvalue"].tolist(),
         "Wavelengths": lengths["wavelength"],
         "FWHM": lengths["fwhm"],
-        "LengthUnits": unit or "of the coordinates",
+        "LengthUnits": solved.unit or "of the coordinates",
         "Sources": [Path(solved.about["source"]).name] if solved.about.get("source") else [],
     }
 
@@ -186,8 +189,8 @@ def _write(folder: Path, name: str, values: np.ndarray, solved: _Solved, extra: 
     """Write modes or maps (m, *shape) as .npz and as images."""
     save(folder / f"{name}.npz", values, solved.place, name=name, extra=extra)
     for suffix in filter(None, solved.images):
-        more = {} if suffix.startswith(".nii") else extra
-        save(folder / f"{name}{suffix}", values.astype(np.float32), solved.place, name=name, extra=more)
+        settings: dict[str, Any] = {"extra": {} if suffix.startswith(".nii") else extra, "provenance": solved.origin}
+        save(folder / f"{name}{suffix}", values.astype(np.float32), solved.place, name=name, **settings)
 
 
 def _stale(args: argparse.Namespace) -> Iterable[Path]:

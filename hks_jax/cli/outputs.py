@@ -95,11 +95,21 @@ def draw_picture(path: Path, draw: Callable[[Path], Any], results: Iterable[Path
         ) from error
 
 
-def write_outputs(folder: Path, result: Result, progress: Progress, draw: Callable[[Path], Any], *images: str) -> Done:
-    """Write hks.npz, report.json, and images of the given suffixes unless they are empty; then hks.png, by `draw`."""
+def write_outputs(
+    folder: Path,
+    result: Result,
+    progress: Progress,
+    draw: Callable[[Path], Any],
+    *images: str,
+    origin: Mapping[str, Any] | None = None,
+) -> Done:
+    """Write hks.npz, report.json, and images of the given suffixes unless they are empty; then hks.png, by `draw`.
+
+    The entries of `origin` are added to the provenance.
+    """
     stale = partial(of_earlier, folder, result.eigenvalues, progress)
     with writing(folder, result.report, progress, stale, {"hks.png": draw}) as (temporary, done):
-        result.save(temporary / "hks", *images, origin={"command": sys.argv})
+        result.save(temporary / "hks", *images, origin={"command": sys.argv, **(origin or {})})
     return done
 
 

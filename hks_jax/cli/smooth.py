@@ -72,6 +72,7 @@ class _Place(NamedTuple):
     domain: TensorField | SimplicialMesh
     inside: Bool[np.ndarray, "*shape"]
     images: tuple[str, ...]  # the suffixes of images
+    origin: dict[str, str]  # entries of their provenance
     about: dict[str, Any]  # the entries of the report about the input
     draw: Callable[..., None]
 
@@ -85,7 +86,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
     if args.others:
         raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one file of maps")
-    place, domain, inside, images, about, draw = (_on_grid if args.mesh is None else _on_mesh)(args, progress)
+    place, domain, inside, images, origin, about, draw = (_on_grid if args.mesh is None else _on_mesh)(args, progress)
     with progress.stage("reading", str(args.file)):
         maps = read_maps(args.file, place)
     where = "voxels" if args.mesh is None else "vertices"
@@ -108,7 +109,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         values = smoothed if len(smoothed) > 1 else smoothed[0]
         for suffix in filter(None, (".npz", *images)):
             stored = values if suffix == ".npz" else values.astype(np.float32)
-            save(folder / f"smoothed{suffix}", stored, place, name="smoothed", provenance=report["settings"])
+            save(folder / f"smoothed{suffix}", stored, place, name="smoothed", provenance=report["settings"] | origin)
     return done
 
 
@@ -126,7 +127,7 @@ def _on_grid(args: argparse.Namespace, progress: Progress) -> _Place:
         progress.warn(message)
     volume = volume.with_mask(field.grid.mask)
     images = (format_of(args.tensors).image,)
-    return _Place(volume, field, field.grid.inside, images, describe_input(volume), partial(_draw, volume))
+    return _Place(volume, field, field.grid.inside, images, {}, describe_input(volume), partial(_draw, volume))
 
 
 def _on_mesh(args: argparse.Namespace, progress: Progress) -> _Place:
@@ -150,9 +151,9 @@ def _on_mesh(args: argparse.Namespace, progress: Progress) -> _Place:
             interpolation=args.interpolation,
         )
     mesh = found.mesh
-    images, about = images_of_mesh(args.mesh, mesh, args.clean), describe_mesh(args.mesh, mesh)
+    (images, origin), about = images_of_mesh(args.mesh, mesh, args.clean), describe_mesh(args.mesh, mesh)
     about |= {"source": str(args.mesh), "tensors": None if args.tensors is None else str(args.tensors)}
-    return _Place(mesh, mesh, mesh.triangulation.used, images, about, partial(_draw_mesh, found))
+    return _Place(mesh, mesh, mesh.triangulation.used, images, origin, about, partial(_draw_mesh, found))
 
 
 def _draw(volume: TensorVolume, args: argparse.Namespace, before: np.ndarray, after: np.ndarray, path: Path) -> None:

@@ -5,6 +5,7 @@ image volume, and the columns of A and S are the volume's axes in scanner coordi
 ([systems](https://surfer.nmr.mgh.harvard.edu/fswiki/CoordinateSystems)).
 """
 
+import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -23,6 +24,7 @@ _TRIANGLES = b"\xff\xff\xfe"
 """The first bytes of FreeSurfer's files of triangles."""
 _VALUES = b"\xff\xff\xff"
 """The first bytes of FreeSurfer's files of one number for each vertex: lh.thickness, lh.curv, lh.sulc and others."""
+_STRUCTURE = "AnatomicalStructurePrimary"
 _GEOMETRY = ("NIFTI_INTENT_POINTSET", "NIFTI_INTENT_TRIANGLE")
 _AXES = 6
 """The largest number of axes that GIFTI allows for an array."""
@@ -145,8 +147,25 @@ def load_maps(path: Path) -> list[Float[np.ndarray, "..."]] | None:
     return None
 
 
+def structure_of(path: Path) -> dict[str, str]:
+    """Return the entry of GIFTI's metadata that names a surface's structure, such as CortexLeft, if it is known.
+
+    GIFTI surfaces contain it, and the names of FreeSurfer's surfaces tell it. Workbench asks for it if a file lacks it.
+    """
+    if is_freesurfer(path):
+        found = {"lh.": "CortexLeft", "rh.": "CortexRight"}.get(path.name[:3])
+    else:
+        image = optional("nibabel").gifti.GiftiImage.from_bytes(content_of(path))
+        metas = [image.meta, *(points.meta for points in image.get_arrays_from_intent("NIFTI_INTENT_POINTSET"))]
+        found = next((meta[_STRUCTURE] for meta in metas if meta.get(_STRUCTURE)), None)
+    return {} if found is None else {_STRUCTURE: str(found)}
+
+
 def write_maps(path: Path, arrays: Mapping[str, Float[np.ndarray, " V"]], record: str) -> None:
-    """Write named maps at the vertices of a surface in GIFTI, and a record of their origin in its metadata."""
+    """Write named maps at the vertices of a surface in GIFTI, and a record of their origin in its metadata.
+
+    The record's entry AnatomicalStructurePrimary, if any, becomes that of the file.
+    """
     gifti = optional("nibabel").gifti
 
     def array_of(name: str, values: np.ndarray) -> Any:
@@ -155,6 +174,8 @@ def write_maps(path: Path, arrays: Mapping[str, Float[np.ndarray, " V"]], record
         return gifti.GiftiDataArray(np.asarray(values, np.float32), *kind, meta=meta)
 
     arrays_of_image = [array_of(name, values) for name, values in arrays.items()]
-    image = gifti.GiftiImage(darrays=arrays_of_image, meta=gifti.GiftiMetaData(provenance=record))
+    structure = {name: value for name, value in json.loads(record).items() if name == _STRUCTURE}
+    meta = gifti.GiftiMetaData({"provenance": record, **structure})
+    image = gifti.GiftiImage(darrays=arrays_of_image, meta=meta)
     with atomic_path(path) as temporary:
         temporary.write_bytes(image.to_bytes())

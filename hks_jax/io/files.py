@@ -137,7 +137,8 @@ def save(
       mesh, the npz also contains ``vertices``, and ``faces`` (triangles) or ``cells`` (tetrahedra).
     - ``.vtu``, ``.vtk``, ``.msh`` (Gmsh), and for triangles ``.ply``: the mesh and one array per time.
     - ``.gii`` (``.func.gii``, ``.shape.gii``), for triangles: one array per time in single precision, without the mesh.
-      Connectome Workbench, freeview and nilearn show the arrays on the surface from which the mesh was read.
+      Connectome Workbench, freeview and nilearn show the arrays on the surface from which the mesh was read. The entry
+      ``AnatomicalStructurePrimary`` of `provenance`, such as ``"CortexLeft"``, becomes that of the file.
 
     Every file contains a JSON record of its origin: the version, the tensors' file with its SHA-256, order and frame,
     the notes about its reading, and `provenance`. For a mesh, except in npz and GIFTI, the record is in a second file,

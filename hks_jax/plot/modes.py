@@ -107,7 +107,8 @@ def _draw_curves(
     waves = np.isfinite(wavelength)
     drawn = waves & (energy > _DECADES * np.max(energy, initial=0.0, where=waves))
     energies.plot(wavelength[drawn], energy[drawn], "o", color="#21918c", markersize=3)
-    energies.set(xscale="log", yscale="log", ylabel="energy in the mode", xlabel=f"wavelength in {unit or 'length'}")
+    wavelengths = f"wavelength in {unit}" if unit else "wavelength"
+    energies.set(xscale="log", yscale="log", ylabel="energy in the mode", xlabel=wavelengths)
     energies.xaxis.set_major_formatter(lambda x, _: number_text(x))
     if drawn.any() and wavelength[drawn].max() < 100 * wavelength[drawn].min():
         energies.xaxis.set_minor_formatter(lambda x, _: number_text(x) if f"{x:.0e}"[0] in "25" else "")

@@ -41,9 +41,10 @@ def rows(path):
 
 def surface(path):
     mesh = hj.examples.sphere_mesh(2)
+    meta = {"AnatomicalStructurePrimary": "CortexRight"}
     kinds = (("POINTSET", "FLOAT32", mesh.vertices), ("TRIANGLE", "INT32", mesh.faces))
     arrays = [
-        nib.gifti.GiftiDataArray(np.asarray(x, d.lower()), f"NIFTI_INTENT_{kind}", f"NIFTI_TYPE_{d}")
+        nib.gifti.GiftiDataArray(np.asarray(x, d.lower()), f"NIFTI_INTENT_{kind}", f"NIFTI_TYPE_{d}", meta=meta)
         for kind, d, x in kinds
     ]
     nib.save(nib.gifti.GiftiImage(darrays=arrays), path)
@@ -107,6 +108,7 @@ def test_surfaces_and_tetrahedra(tmp_path, capsys):
     assert main(["modes", str(tmp_path / "s.surf.gii"), "-o", str(out), "-k", "9", "-q"]) == 0
     modes = np.stack([array.data for array in nib.load(out / "modes.func.gii").darrays])
     assert modes.shape == (9, 42)
+    assert json.loads((out / "modes.json").read_text())["LengthUnits"] == "mm"
     again = ["modes", str(tmp_path / "s.surf.gii"), "-o", str(tmp_path / "two"), "-k", "9", "-q", "--map"]
     assert main([*again, str(out / "modes.func.gii")]) == 0
     c = [[float(row[f"map_{i}"]) for i in range(1, 10)] for row in rows(tmp_path / "two" / "coefficients.tsv")]
@@ -176,6 +178,7 @@ def test_a_surface_in_gives_a_surface_out(tmp_path, capsys):
     assert [array.meta["Name"] for array in image.darrays] == ["hks_0_t0.5", "hks_1_t1"]
     assert {array.data.dtype for array in image.darrays} == {np.dtype("float32")}
     assert json.loads(image.meta["provenance"])["settings"]["k"] == 9
+    assert image.meta["AnatomicalStructurePrimary"] == "CortexLeft"
     assert hj.io.read_mesh(folder / "hks.vtu").faces.shape == mesh.faces.shape
     read = hj.io.read_maps(tmp_path / "lh.thickness", mesh)
     np.testing.assert_allclose(read, thickness[None], rtol=1e-6)
@@ -215,7 +218,9 @@ def test_maps_are_smoothed_on_a_surface(tmp_path, rng, capsys):
     found = smoothed_on(tmp_path, tmp_path / "s.surf.gii", f, "--inside", str(tmp_path / "inside.npy"))
     cap = hj.SurfaceMesh(vertices, mesh.faces, mask=inside)
     np.testing.assert_allclose(found, hj.smooth(cap, f, 0.8), atol=1e-12)
-    maps = np.stack([array.data for array in nib.load(tmp_path / "out" / "smoothed.func.gii").darrays])
+    image = nib.load(tmp_path / "out" / "smoothed.func.gii")
+    assert image.meta["AnatomicalStructurePrimary"] == "CortexRight"
+    maps = np.stack([array.data for array in image.darrays])
     np.testing.assert_allclose(maps, found, atol=1e-6)
     again = ["smooth", str(tmp_path / "f.npy"), "--fwhm", "0.8", "-o", str(tmp_path / "out"), "-q"]
     calls = {
