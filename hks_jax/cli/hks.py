@@ -10,7 +10,8 @@ Compute the heat kernel signature of a field of diffusion tensors. FILE contains
 
 The command writes to the folder OUT: hks.npz, an image or a mesh in FILE's format, hks.png and report.json. Times are
 along the fourth axis of the image. For a GIFTI or FreeSurfer surface, the mesh is hks.vtu, for ParaView; hks.func.gii
-has the values at the vertices of FILE, for Workbench, freeview and nilearn.
+has the values at the vertices of FILE, for Workbench, freeview and nilearn. Beside files of VTK, hks.pvd lists the same
+values as a time series of files, for ParaView.
 
 examples:
   hks-jax hks tensor.nii.gz -o out --metric inverse

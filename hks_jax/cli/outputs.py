@@ -22,6 +22,8 @@ from hks_jax.storage import atomic_folder, atomic_path
 REPORT = "report.json"
 PAIRS = "pairs.npz"
 """The name of the file of saved eigenpairs."""
+_VTK = (".vtu", ".vtk", ".vti")
+"""The suffixes of VTK's files, which ParaView opens."""
 _OPTIONAL = ("nibabel", "dipy", "pynrrd", "vtk", "meshio")
 
 
@@ -105,11 +107,12 @@ def write_outputs(
 ) -> Done:
     """Write hks.npz, report.json, and images of the given suffixes unless they are empty; then hks.png, by `draw`.
 
-    The entries of `origin` are added to the provenance.
+    The entries of `origin` are added to the provenance. Beside files of VTK, the times are also written as a series.
     """
+    series = (".pvd",) if len(result.times) > 1 and any(suffix in _VTK for suffix in images) else ()
     stale = partial(of_earlier, folder, result.eigenvalues, progress)
     with writing(folder, result.report, progress, stale, {"hks.png": draw}) as (temporary, done):
-        result.save(temporary / "hks", *images, origin={"command": sys.argv, **(origin or {})})
+        result.save(temporary / "hks", *images, *series, origin={"command": sys.argv, **(origin or {})})
     return done
 
 

@@ -1,5 +1,6 @@
 """Read tensor volumes; write results and tensors atomically, with a record of their origin."""
 
+import json
 import math
 import os
 import re
@@ -7,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -18,11 +20,12 @@ from hks_jax.io import mesh, nifti
 from hks_jax.io.formats import WRITTEN, format_of
 from hks_jax.io.masks import mask_on
 from hks_jax.io.repair import Repair, repair_tensors
+from hks_jax.io.tables import write_json
 from hks_jax.io.tensor_order import Frame, Order
 from hks_jax.io.units import Unit, in_mm2_per_s
 from hks_jax.io.volume import TensorVolume, describe, digest
 from hks_jax.io.vtk_image import by_time
-from hks_jax.storage import write_npz
+from hks_jax.storage import atomic_path, write_npz
 
 _NAME = re.compile(r"[A-Za-z0-9_.-]+")
 """The names of arrays that all formats can hold: PLY has no spaces, Gmsh no quotation marks, VTU no "<"."""
@@ -139,10 +142,12 @@ def save(
     - ``.gii`` (``.func.gii``, ``.shape.gii``), for triangles: one array per time in single precision, without the mesh.
       Connectome Workbench, freeview and nilearn show the arrays on the surface from which the mesh was read. The entry
       ``AnatomicalStructurePrimary`` of `provenance`, such as ``"CortexLeft"``, becomes that of the file.
+    - ``.pvd``: a time series for ParaView, with the times in `extra`. The file lists one file for each time, which are
+      written beside it (NAME.0.vti, … on grids and NAME.0.vtu, … on meshes).
 
     Every file contains a JSON record of its origin: the version, the tensors' file with its SHA-256, order and frame,
-    the notes about its reading, and `provenance`. For a mesh, except in npz and GIFTI, the record is in a second file,
-    whose path is `path` with ``.json`` appended. Files are written atomically.
+    the notes about its reading, and `provenance`. For a time series, and for a mesh except in npz and GIFTI, the record
+    is in a second file, whose path is `path` with ``.json`` appended. Files are written atomically.
 
     Args:
         path: the file; missing folders are created.
@@ -178,7 +183,9 @@ def save(
     if n not in (0, 1) or array.shape[n:] != shape:
         raise ValueError(f"values: got shape {array.shape}; expected {shape}, or (n_times, *shape)")
     extra = dict(extra or {})
-    if not isinstance(volume, SimplicialMesh):
+    if file.suffix.lower() == ".pvd":
+        _save_series(file, array, volume, name, extra, provenance)
+    elif not isinstance(volume, SimplicialMesh):
         write = format_of(file, WRITTEN).write
         assert write is not None
         write(file, array, volume, name, extra, describe(volume, provenance))
@@ -189,6 +196,36 @@ def save(
     else:
         mesh.write(file, by_time(name, array, n, extra), volume, describe(None, provenance))
     return file
+
+
+def _save_series(
+    path: Path,
+    array: np.ndarray,
+    place: TensorVolume | SimplicialMesh,
+    name: str,
+    extra: Mapping[str, Any],
+    provenance: Mapping[str, Any] | None,
+) -> None:
+    """Write one VTK file for each time, and the collection of them."""
+    times = np.ravel(extra.get("times", ()))
+    if array.ndim != 1 + (1 if isinstance(place, SimplicialMesh) else place.dimension) or len(times) != len(array):
+        raise ValueError(
+            f"extra: got {len(times)} times for values of shape {array.shape}; expected values (n_times, *shape) and "
+            'extra={"times": …} with n_times numbers, as a time series has'
+        )
+    collection = ElementTree.Element("VTKFile", type="Collection", version="0.1")
+    entries = ElementTree.SubElement(collection, "Collection")
+    record = describe(None if isinstance(place, SimplicialMesh) else place, provenance)
+    for i, (time, values) in enumerate(zip(times.tolist(), array, strict=True)):
+        part = path.with_name(f"{path.stem}.{i}{'.vtu' if isinstance(place, SimplicialMesh) else '.vti'}")
+        if isinstance(place, SimplicialMesh):
+            mesh.write(part, {name: values}, place)
+        else:
+            save(part, values, place, name=name, provenance=provenance)
+        ElementTree.SubElement(entries, "DataSet", timestep=repr(time), part="0", file=part.name)
+    with atomic_path(path) as temporary:
+        ElementTree.ElementTree(collection).write(temporary, encoding="utf-8", xml_declaration=True)
+    write_json(path.with_name(f"{path.name}.json"), json.loads(record))
 
 
 def save_tensors(

@@ -137,8 +137,8 @@ def is_surface(path: Path) -> bool:
     return path.name.lower().endswith((".gii", ".gii.gz")) or cortex.is_freesurfer(path)
 
 
-def write(path: Path, arrays: Mapping[str, Float[np.ndarray, " V"]], mesh: SimplicialMesh, record: str) -> None:
-    """Write a mesh with values at its vertices, and a record of their origin to the file ``path.json``.
+def write(path: Path, arrays: Mapping[str, Float[np.ndarray, " V"]], mesh: SimplicialMesh, record: str = "") -> None:
+    """Write a mesh with values at its vertices, and a record of their origin, if any, to the file ``path.json``.
 
     A GIFTI file has the values and the record, and no mesh.
     """
@@ -154,7 +154,8 @@ def write(path: Path, arrays: Mapping[str, Float[np.ndarray, " V"]], mesh: Simpl
     whole = library.Mesh(np.asarray(mesh.vertices), cells, point_data={k: np.asarray(v) for k, v in arrays.items()})
     with atomic_path(path) as temporary:
         getattr(library, WRITTEN[suffix]).write(str(temporary), whole)
-        write_json(path.with_name(f"{path.name}.json"), json.loads(record))
+        if record:
+            write_json(path.with_name(f"{path.name}.json"), json.loads(record))
 
 
 def _load(path: str | os.PathLike[str], clean: bool, in_space: bool = False) -> tuple[Loaded, str]:

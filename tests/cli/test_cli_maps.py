@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+from xml.etree import ElementTree
 
 import nibabel as nib
 import numpy as np
@@ -180,11 +181,18 @@ def test_a_surface_in_gives_a_surface_out(tmp_path, capsys):
     assert json.loads(image.meta["provenance"])["settings"]["k"] == 9
     assert image.meta["AnatomicalStructurePrimary"] == "CortexLeft"
     assert hj.io.read_mesh(folder / "hks.vtu").faces.shape == mesh.faces.shape
+    series = ElementTree.parse(folder / "hks.pvd").getroot().findall("Collection/DataSet")
+    assert [float(each.get("timestep")) for each in series] == [0.5, 1]
+    for each, array in zip(series, image.darrays, strict=True):
+        values = hj.io.read_mesh_arrays(folder / each.get("file"))["hks"]
+        np.testing.assert_allclose(values, array.data, rtol=1e-6)
     read = hj.io.read_maps(tmp_path / "lh.thickness", mesh)
     np.testing.assert_allclose(read, thickness[None], rtol=1e-6)
     # Cleaning may number the vertices anew, and other formats have values themselves.
     assert main(["hks", white, "-o", str(folder), "-k", "9", "--times", "0.5", "-q", "--clean"]) == 0
     assert not (folder / "hks.func.gii").exists()
+    assert not (folder / "hks.pvd").exists()  # for one time, and no files of an earlier series stay
+    assert not (folder / "hks.0.vtu").exists()
     np.save(tmp_path / "lh.npy", thickness)
     told = ["lh.npy", "lh.thickness"]
     projected = []

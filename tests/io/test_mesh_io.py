@@ -1,6 +1,7 @@
 """Meshes: files that meshio and VTK wrote, against what meshio reads; values at vertices, read by meshio."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -257,3 +258,17 @@ def test_bad_meshes(tmp_path, capsys):
     with pytest.raises(ValueError, match=r"expected \(6,\), or \(n_times, \*shape\)"):
         save(tmp_path / "v.ply", np.zeros(7), mesh)
     assert capsys.readouterr().out == ""  # meshio's own reader prints, and ends the process
+
+
+def test_a_series_has_a_file_for_each_time(tmp_path):
+    sphere = hj.examples.sphere_mesh(2)
+    values = np.arange(84.0).reshape(2, 42)
+    path = save(tmp_path / "u.pvd", values, sphere, name="u", extra={"times": [0.25, 3]})
+    text = path.read_text(encoding="utf-8")
+    assert re.findall(r'timestep="([^"]*)".*?file="([^"]*)"', text) == [("0.25", "u.0.vtu"), ("3.0", "u.1.vtu")]
+    for i in range(2):
+        np.testing.assert_array_equal(read_mesh_arrays(tmp_path / f"u.{i}.vtu")["u"], values[i])
+    assert (tmp_path / "u.pvd.json").is_file()
+    for given in ({}, {"times": [1.0]}):
+        with pytest.raises(ValueError, match=r"extra: got [01] times for values of shape \(2, 42\)"):
+            save(tmp_path / "v.pvd", values, sphere, extra=given)

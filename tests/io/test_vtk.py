@@ -281,3 +281,16 @@ def test_polygons_that_lead_astray(tmp_path, version, binary, old, new):
     path.write_bytes(content.replace(old, new, 1))
     with pytest.raises(ValueError, match=r"s\.vtk: the file is damaged or not readable polygonal data"):
         hj.io.read_mesh(path)
+
+
+def test_a_series_on_a_grid_has_an_image_for_each_time(tmp_path):
+    place = TensorVolume(np.tile(np.eye(3), (4, 3, 2, 1, 1)), (1.0, 2.0, 3.0), (5.0, 0.0, 0.0))
+    values = np.arange(48.0).reshape(2, 4, 3, 2)
+    path = save(tmp_path / "u.pvd", values, place, name="u", extra={"times": [0.25, 3]})
+    assert path.read_text(encoding="utf-8").count("<DataSet") == 2
+    for i in range(2):
+        reader = vtkXMLImageDataReader()
+        reader.SetFileName(str(tmp_path / f"u.{i}.vti"))
+        reader.Update()
+        found = vtk_to_numpy(reader.GetOutput().GetPointData().GetArray("u"))
+        np.testing.assert_array_equal(found.reshape(2, 3, 4).transpose(2, 1, 0), values[i])
