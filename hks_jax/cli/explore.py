@@ -9,6 +9,7 @@ examples:
   hks-jax hks tensor.nii.gz -o out --mask mask.nii.gz --slice z=14 --metric inverse --times auto:24
   hks-jax explore out
   hks-jax explore out -o page.html --labels atlas.nii.gz --names names.tsv --title "Subject 7"
+  hks-jax explore out --anatomy T1w.nii.gz
 """
 
 import argparse
@@ -18,6 +19,7 @@ from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import Done
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.stats import names_of
+from hks_jax.io import sample_image
 from hks_jax.io.masks import read_labels
 from hks_jax.io.result import Result, signature_file
 
@@ -26,6 +28,9 @@ result RESULT  the folder OUT that 'hks-jax hks' wrote, or an .npz from there
 -o,--output PAGE  the page (default: explore.html in OUT)
 --labels FILE  region numbers on the same voxels or at the vertices, with 0 for unlabelled (NIfTI, MRtrix, NRRD or .npy)
 @names
+--anatomy FILE
+    an anatomical image, such as a T1-weighted one in the space of the tensors, which lies in grey under the maps. It is
+    interpolated at the voxels of the result through the affines (NIfTI, MRtrix or NRRD)
 --title TEXT  the page's title (default: the name of the tensors' file)
 --unit-of-t TEXT  unit of t, if the result does not have it (default: that of the result)
 @view
@@ -52,10 +57,13 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         refuse(args, ("names",), "this option names the labels, which are missing; pass --labels too")
     with progress.stage("reading", str(source)):
         result = Result.read(source, "hks", over_times=True)
-        labels = names = None
+        labels = names = anatomy = None
         if args.labels is not None:
             labels, names = read_labels(args.labels, result.place), names_of(args.labels, args.names)[1]
+        if args.anatomy is not None:
+            anatomy = sample_image(args.anatomy, result.volume)
     with progress.stage("writing", str(page)):
         title = args.title or Path(getattr(result.place, "source", "")).name or source.parent.name
-        explore(result, page, labels=labels, label_names=names, title=title, unit=args.unit_of_t, view=args.view)
+        style = {"title": title, "unit": args.unit_of_t, "view": args.view}
+        explore(result, page, anatomy=anatomy, labels=labels, label_names=names, **style)
     return Done([page], {"source": str(source), "times": result.times.tolist()})

@@ -20,6 +20,7 @@ from hks_jax.io.repair import find_invalid as find_invalid
 from hks_jax.io.repair import positive_tensors as positive_tensors
 from hks_jax.io.repair import repair_tensors as repair_tensors
 from hks_jax.io.result import Result as Result
+from hks_jax.io.sampling import sample_image as sample_image
 from hks_jax.io.sampling import sample_tensors as sample_tensors
 from hks_jax.io.tensor_order import ORDERS as ORDERS
 from hks_jax.io.units import UNITS as UNITS

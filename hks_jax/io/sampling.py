@@ -1,5 +1,6 @@
-"""Interpolate the tensors of a volume at points in space, such as the vertices of a cortical surface."""
+"""Interpolate tensors at points in space, such as the vertices of a cortical surface, and images at others' voxels."""
 
+import os
 from typing import Any
 
 import numpy as np
@@ -7,6 +8,8 @@ from jaxtyping import Float, Shaped
 from scipy.ndimage import map_coordinates
 
 from hks_jax.checks import require_real
+from hks_jax.io.formats import IMAGES
+from hks_jax.io.masks import image_of
 from hks_jax.io.tensor_order import nearest_rotation
 from hks_jax.io.volume import TensorVolume
 
@@ -59,3 +62,44 @@ def sample_tensors(volume: TensorVolume, points: Any) -> Float[np.ndarray, "n 3 
     for i, j in zip(*np.triu_indices(3), strict=True):
         sampled[:, i, j] = sampled[:, j, i] = at(np.where(inside, volume.tensors[..., i, j], 0)) / weights
     return rotation @ sampled @ rotation.T
+
+
+def sample_image(path: str | os.PathLike[str], on: TensorVolume) -> Float[np.ndarray, "*shape"]:
+    """Read an image, such as a T1-weighted one, and interpolate it linearly at the voxels of a volume or slice.
+
+    Both have affines, which say where the voxels are in space. The result is NaN at voxels outside the image.
+
+    Args:
+        path: an image (nx, ny, nz) in NIfTI, MRtrix or NRRD.
+        on: the volume or slice.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        ValueError: the kind of file is unknown, the image has other axes, an affine is missing, or the image contains
+            no voxel of the volume.
+        ImportError: nibabel (for NIfTI) or pynrrd (for NRRD) is missing.
+
+    Examples:
+        >>> import nibabel
+        >>> image = nibabel.Nifti1Image(np.indices((3, 3, 3))[0] * 1.0, np.diag([2.0, 2, 2, 1]))
+        >>> nibabel.save(image, folder / "T1.nii")
+        >>> volume = hj.io.TensorVolume(np.tile(np.eye(3), (4, 2, 2, 1, 1)), (1.0,) * 3, (0.0,) * 3, affine=np.eye(4))
+        >>> hj.io.sample_image(folder / "T1.nii", volume)[:, 0, 0]  # every voxel of the image is two of the volume
+        array([0. , 0.5, 1. , 1.5])
+    """
+    name = os.fspath(path)
+    values, place = image_of(name, on.affine, tuple(suffix for suffix in IMAGES if not suffix.startswith(".np")))
+    if values.ndim != 3:
+        raise ValueError(f"{name}: got shape {values.shape}; expected an image of three axes")
+    if place is None or on.affine is None:
+        raise ValueError(f"{name}: got {'an image' if place is None else 'a volume'} without an affine; expected both")
+    to_image = np.linalg.solve(place, on.affine)
+    indices = np.indices(on.volume_shape).reshape(3, -1)
+    voxels = np.round(to_image[:3, :3] @ indices + to_image[:3, 3:], 6)  # rounding errors leave the image's last voxels
+    sampled = map_coordinates(values.astype(np.float64), voxels, order=1, mode="constant", cval=np.nan)
+    if not np.isfinite(sampled).any():
+        raise ValueError(
+            f"{name}: the image contains no voxel of {on.source or 'the volume'}; expected images of one position in "
+            f"space. The affines are {place.round(4).tolist()} and {on.affine.round(4).tolist()}"
+        )
+    return sampled.reshape(on.shape)

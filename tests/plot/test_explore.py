@@ -312,6 +312,63 @@ def test_colours_are_those_of_the_values(plane):
     assert plane.text("#signature-bar").endswith(f"{1 + half:.2f}".rstrip("0"))
 
 
+def in_space():
+    """A result with a voxel that runs from right to left, and an image of other voxels that is linear in space."""
+    affine = np.diag([-2.0, 3.0, 2.5, 1.0])
+    affine[:3, 3] = 7, -4, 2
+    values = signature((12, 10, 3))
+    place = TensorVolume(np.tile(np.eye(3), (12, 10, 3, 1, 1)), (2.0, 3.0, 2.5), (0.0,) * 3, affine=affine)
+    place = place.with_mask(np.isfinite(values[0]))
+    of_image = np.array([[0, 0, 1.5, -20.0], [1.25, 0, 0, -8], [0, 2, 0, 0], [0, 0, 0, 1]])
+    slope = np.array([1.0, 0.5, -2.0])
+    image = np.tensordot(of_image[:3, :3].T @ slope, np.indices((32, 8, 14)), 1) + of_image[:3, 3] @ slope
+    expected = np.tensordot(affine[:3, :3].T @ slope, np.indices((12, 10, 3)), 1) + affine[:3, 3] @ slope
+    return Result(place, values, TIMES, source="a file"), nib.Nifti1Image(image, of_image), expected
+
+
+def test_an_anatomical_image_lies_under_the_maps_at_its_place_in_space(tmp_path, capsys):
+    result, image, expected = in_space()
+    nib.save(image, tmp_path / "T1.nii.gz")
+    sampled = hj.io.sample_image(tmp_path / "T1.nii.gz", result.volume)
+    known = np.isfinite(sampled)
+    assert 0.3 < known.mean() < 1  # the image does not cover all voxels
+    np.testing.assert_allclose(sampled[known], expected[known], atol=1e-4)
+    one = result.volume.slice("z", 1)
+    np.testing.assert_array_equal(hj.io.sample_image(tmp_path / "T1.nii.gz", one), sampled[..., 1])
+    save(tmp_path / "hks.npz", result.values, result.volume, name="hks", extra={"times": TIMES})
+    command = ["explore", str(tmp_path / "hks.npz"), "--anatomy"]
+    assert main([*command, str(tmp_path / "T1.nii.gz"), "-q"]) == 0
+    text = (tmp_path / "explore.html").read_text(encoding="utf-8")
+    about = json.loads(re.search(r'id="about">([^<]*)<', text)[1])
+    grey = block(text, "anatomy", np.uint8).reshape(about["shape"]).astype(float)
+    low, high = np.quantile(sampled[known], [0.01, 0.99])
+    levels = np.where(known, 1 + 254 * np.clip((sampled - low) / (high - low), 0, 1), 0)
+    np.testing.assert_allclose(grey, levels[::-1], atol=0.51)  # left is on the left, and the margin reaches the sides
+    nib.save(
+        nib.Nifti1Image(image.get_fdata(), np.diag([1, 1, 1, 1.0]) + 900 * np.eye(4, k=3)), tmp_path / "far.nii.gz"
+    )
+    assert main([*command, str(tmp_path / "far.nii.gz"), "-q"]) == 2
+    assert "the image contains no voxel of" in capsys.readouterr().err
+    with pytest.raises(ValueError, match=r"anatomy: got shape \(3, 3\); expected the grid's shape \(12, 10, 3\)"):
+        explore(result, tmp_path / "no.html", anatomy=np.ones((3, 3)))
+
+
+@needs_browser
+def test_maps_are_mixed_with_the_anatomy(browser, tmp_path):
+    anatomy = np.linspace(0, 1, SHAPE[0] * SHAPE[1]).reshape(SHAPE)
+    browser.open(explore(of(signature()), tmp_path / "anatomy.html", anatomy=anatomy))
+    node, outside = (6, 4), (0, 17)
+    browser.choose("#opacity", "100")
+    own = np.array(pixel_of(browser, node))
+    browser.choose("#opacity", "0")
+    grey = np.array(pixel_of(browser, node))
+    level = 1 + 254 * np.clip((anatomy[node] - 0.01) / 0.98, 0, 1)
+    np.testing.assert_allclose(grey, level, atol=2)
+    browser.choose("#opacity", "40")
+    np.testing.assert_allclose(pixel_of(browser, node), 0.4 * own + 0.6 * grey, atol=2)
+    np.testing.assert_allclose(pixel_of(browser, outside), 1 + 254 * (anatomy[outside] - 0.01) / 0.98, atol=2)
+
+
 @needs_browser
 def test_what_noise_could_make_fades_and_points_have_bands(browser, tmp_path):
     browser.problems.clear()

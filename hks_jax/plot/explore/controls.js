@@ -64,6 +64,7 @@ function setUp() {
   for (const row of document.querySelectorAll(".noise")) row.hidden = !deviations;
   for (const row of document.querySelectorAll(".fades")) row.hidden = !scores;
   for (const row of document.querySelectorAll(".rim")) row.hidden = !near;
+  for (const row of document.querySelectorAll(".anatomy")) row.hidden = !anatomy;
   options(element("plane"), AXES.map((_, a) => `across ${named(a)} (${[0, 1, 2].filter((b) => b !== a).map(named).join(", ")})`));
   options(element("quantity"), quantities.map((q) => q.name));
   options(element("layer-name"), layers.map((layer) => layer.name));
@@ -87,6 +88,7 @@ function setUp() {
   onInput("same", () => {});
   onInput("rim", () => {});
   onInput("fade", () => {});
+  onInput("opacity", () => {});
   onInput("layer-name", (input) => (state.layer = Number(input.value)));
   onInput("from", (input) => setSpan(Number(input.value), Math.max(Number(input.value), state.to)));
   onInput("to", (input) => setSpan(Math.min(Number(input.value), state.from), Number(input.value)));

@@ -22,6 +22,7 @@ const values = floats("values"); // for each time, at the inside nodes in the or
 const deviations = about.noise ? floats("deviation") : null; // the standard deviations of the values due to noise
 const scores = about.fades ? floats("z") : null; // distances from the values of constant tensors, as normal numbers
 const near = about.rim === null ? null : bytes("near"); // whether the boundary contributes over a tenth
+const anatomy = about.anatomy ? bytes("anatomy") : null; // levels of grey at all nodes of the grid; 0 where there is none
 const layers = about.layers.map((layer, i) => ({ ...layer, values: floats(`layer-${i}`) }));
 const labels = about.labels.length ? integers("labels") : null;
 
@@ -32,9 +33,11 @@ for (let p = 0; p < inside.length; p++) if (inside[p]) nodeOfPlace[p] = count++;
 const placeOfNode = new Int32Array(count);
 for (let p = 0; p < inside.length; p++) if (nodeOfPlace[p] >= 0) placeOfNode[nodeOfPlace[p]] = p;
 
+const flatOf = (place) => (place[0] * shape[1] + place[1]) * shape[2] + place[2];
+
 function nodeAt(place) {
   for (let a = 0; a < 3; a++) if (!(place[a] >= 0 && place[a] < shape[a])) return -1;
-  return nodeOfPlace[(place[0] * shape[1] + place[1]) * shape[2] + place[2]];
+  return nodeOfPlace[flatOf(place)];
 }
 
 function placeAt(node) {

@@ -116,12 +116,16 @@ class SliceImage {
     const rgb = [0, 0, 0];
     const place = [0, 0, 0];
     place[axis] = index;
+    const opacity = anatomy ? element("opacity").value / 100 : 1;
     for (let u = 0; u < nu; u++) {
       for (let v = 0; v < nv; v++) {
         [place[across], place[up]] = [u, v];
         const node = nodeAt(place);
-        if (node < 0) continue;
-        colour(node, rgb);
+        const grey = anatomy ? anatomy[flatOf(place)] : 0;
+        if (node < 0 && !grey) continue;
+        if (node < 0) rgb.fill(grey);
+        else colour(node, rgb);
+        if (node >= 0 && grey) for (let c = 0; c < 3; c++) rgb[c] += (1 - opacity) * (grey - rgb[c]);
         const p = 4 * ((nv - 1 - v) * nu + Math.floor(this.across(u + 0.5)));
         for (let c = 0; c < 3; c++) pixels.data[p + c] = rgb[c];
         pixels.data[p + 3] = 255;

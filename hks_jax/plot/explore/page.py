@@ -32,6 +32,8 @@ from hks_jax.storage import atomic_path
 SCRIPTS = ("data", "colours", "image", "mesh", "curves", "regions", "controls", "main")
 """The page's scripts in the order of their dependencies."""
 COLOURS = {"sequential": "viridis", "diverging": "RdBu_r", "distance": "inferno_r", "grey": "gray"}
+AROUND = 6
+"""The number of nodes around the domain at which the anatomical image is shown."""
 LIMIT = 256 * 1024**2
 """The maximum bytes of numbers in a page. Base64 makes numbers a third longer, and browsers limit texts to 512 MiB."""
 
@@ -41,6 +43,7 @@ def explore(
     path: str | os.PathLike[str],
     *,
     maps: Mapping[str, Any] | None = None,
+    anatomy: Real[ArrayLike, "*shape"] | None = None,
     labels: Real[ArrayLike, "*shape"] | None = None,
     label_names: Mapping[int, str] | None = None,
     title: str = "Heat kernel signature",
@@ -69,6 +72,8 @@ def explore(
             contributes over a tenth are hatched.
         path: the file of the page; its folder is created.
         maps: additional maps (*shape) by name.
+        anatomy: (*shape) an anatomical image at the nodes of a grid (`hks_jax.io.sample_image`), which lies in grey
+            under the maps and around the domain; NaN where it has no value. A slider sets the opacity of the maps.
         labels: (*shape) integers that define regions, 0 for none.
         label_names: the names of the labels.
         title: the page's title.
@@ -79,8 +84,8 @@ def explore(
         The path.
 
     Raises:
-        ValueError: if the result is on tetrahedra, if times do not increase, if no node is finite, if maps or labels
-            have another shape, or if there are more numbers than a browser can open.
+        ValueError: if the result is on tetrahedra, if times do not increase, if no node is finite, if maps, labels or
+            the anatomy have another shape, or if there are more numbers than a browser can open.
 
     Examples:
         >>> volume = hj.io.TensorVolume(np.array(field.tensors), field.grid.spacing, field.grid.origin)
@@ -91,8 +96,10 @@ def explore(
     """
     require_result(result)
     axes, turned, facts = None, None, _facts(result)
+    grey = None if anatomy is None else _grey(anatomy, result)
     if isinstance(result.place, TensorVolume) and (turned := placed(result.place, None, view)) is not None:
         result, maps, labels, axes = _turned(result, maps, labels, turned)
+        grey = None if grey is None else turned.array(grey)
     mesh, noise = result.place, result.arrays.get("deviation")
     if isinstance(mesh, TetMesh):
         raise ValueError(f"{result.source}: got a result on tetrahedra; expected a grid or a surface. Use ParaView")
@@ -136,9 +143,11 @@ def explore(
     near = result.near_rim
     if near is not None:
         shown["near"] = near[:, inside]
-    box = bounding_box(inside, margin=0)
+    box = bounding_box(inside, margin=0 if grey is None else AROUND)
     shown_inside = inside[inside] if surface else inside[box]
     numbers = {"inside": _base64(shown_inside, "u1")}
+    if grey is not None:
+        numbers["anatomy"] = _base64(grey[box], "u1")
     numbers |= {name: _base64(array, "u1" if name == "near" else "<f4") for name, array in shown.items()}
     numbers |= {f"layer-{i}": _base64(array, "<f4") for i, array in enumerate(layers.values())}
     names: dict[int, str] = {}
@@ -166,6 +175,7 @@ def explore(
         "noise": noise is not None,
         "fades": result.z is not None,
         "rim": None if near is None else FREE,
+        "anatomy": grey is not None,
         "start": [0] if surface else middle_node(shown_inside),
         "layers": [
             {"name": name, "kind": "scalar" if array.ndim == 1 else "direction"} for name, array in layers.items()
@@ -179,6 +189,20 @@ def explore(
     with atomic_path(path) as temporary:
         temporary.write_text(page, encoding="utf-8", errors="replace")  # the title may be a file name
     return Path(path)
+
+
+def _grey(anatomy: Any, result: Result) -> np.ndarray:
+    """Return the levels of grey from 1 to 255 of an image at the nodes of a grid, and 0 where it has no value."""
+    require_real("anatomy", anatomy)
+    image, shape = np.asarray(anatomy, np.float64), result.volume.shape
+    if image.shape != shape:
+        raise ValueError(f"anatomy: got shape {image.shape}; expected the grid's shape {shape}")
+    known = np.isfinite(image)
+    if not known.any():
+        raise ValueError("anatomy: got no finite value; expected an image of the domain")
+    low, high = np.quantile(image[known], [0.01, 0.99])
+    levels = 1 + 254 * np.clip((np.where(known, image, low) - low) / max(high - low, np.finfo(float).tiny), 0, 1)
+    return np.where(known, np.rint(levels), 0)
 
 
 def _facts(result: Result) -> dict[str, Any]:
