@@ -29,8 +29,8 @@ result RESULT  the folder OUT that 'hks-jax hks' wrote, or an .npz from there
 --labels FILE  region numbers on the same voxels or at the vertices, with 0 for unlabelled (NIfTI, MRtrix, NRRD or .npy)
 @names
 --anatomy FILE
-    an anatomical image, such as a T1-weighted one in the space of the tensors, which lies in grey under the maps. It is
-    interpolated at the voxels of the result through the affines (NIfTI, MRtrix or NRRD)
+    an anatomical image, such as a T1-weighted one in the space of the tensors, which lies in grey under the signature.
+    It is interpolated at the voxels of the result through the affines (NIfTI, MRtrix or NRRD)
 --title TEXT  the page's title (default: the name of the tensors' file)
 --unit-of-t TEXT  unit of t, if the result does not have it (default: that of the result)
 @view

@@ -101,3 +101,25 @@ def test_the_command_line_and_what_is_refused(tmp_path, volume, capsys):
     nibabel.freesurfer.write_geometry(tmp_path / "rh.white", places, faces, create_stamp="made for a test")
     with pytest.raises(ValueError, match="does not state the position of its volume"):
         hj.io.read_mesh(tmp_path / "rh.white", in_space=True)
+
+
+def test_a_spot_on_a_surface_is_smoothed_along_the_fibre(tmp_path, volume):
+    """The mean over the surface's axes of the squared FWHM is the square of the number given, in mm."""
+    image, affine = volume
+    places, faces = square(affine)
+    freesurfer(tmp_path / "lh.white", places, faces, affine)
+    np.save(tmp_path / "spot.npy", np.arange(81.0) == 40)
+    command = ["smooth", str(tmp_path / "spot.npy"), "--mesh", str(tmp_path / "lh.white"), "--tensors", str(image)]
+    assert main([*command, "--frame", "voxel", "--fwhm", "2", "-o", str(tmp_path / "out"), "-q"]) == 0
+    spread = nibabel.load(tmp_path / "out" / "smoothed.func.gii").darrays[0].data.astype(np.float64)
+    mesh = hj.SurfaceMesh.from_tensors(places, faces, np.tile(TENSOR, (81, 1, 1)), operator="fick")
+    np.testing.assert_allclose(spread, hj.smooth(mesh, np.arange(81.0) == 40, 2.0), atol=1e-4)
+    weights = spread * np.asarray(hj.assemble(mesh, mass="lumped").mass.diagonal())
+    away = places - places[40]
+    covariance = np.einsum("v,vx,vy->xy", weights / weights.sum(), away, away)
+    _, sizes, _ = np.linalg.svd(covariance)
+    assert np.sqrt(8 * np.log(2) * sizes[:2].sum() / 2) == pytest.approx(2, rel=0.03)
+    frame = np.linalg.svd(away, full_matrices=False)[2][:2]
+    tangential = frame @ TENSOR @ frame.T
+    shape = frame @ covariance @ frame.T
+    np.testing.assert_allclose(shape / np.trace(shape), tangential / np.trace(tangential), atol=0.03)

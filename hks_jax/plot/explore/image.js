@@ -108,7 +108,7 @@ class SliceImage {
   }
 
   // colour(node, out) writes three numbers from 0 to 255.
-  draw(colour, { points, chosen, sticks, hatched }) {
+  draw(colour, { points, chosen, sticks, hatched, opaque }) {
     const { axis, across, up, index } = this.plane;
     const [nu, nv] = [shape[across], shape[up]];
     [this.tile.width, this.tile.height] = [nu, nv];
@@ -116,7 +116,7 @@ class SliceImage {
     const rgb = [0, 0, 0];
     const place = [0, 0, 0];
     place[axis] = index;
-    const opacity = anatomy ? element("opacity").value / 100 : 1;
+    const opacity = anatomy && !opaque ? element("opacity").value / 100 : 1;
     for (let u = 0; u < nu; u++) {
       for (let v = 0; v < nv; v++) {
         [place[across], place[up]] = [u, v];

@@ -157,13 +157,13 @@ function drawLayer(layer, shared) {
     const colour = (node, rgb) => {
       for (let a = 0; a < 3; a++) rgb[a] = Math.min(255, 25 + 330 * Math.abs(layer.values[3 * node + a]));
     };
-    images.layer.draw(colour, { ...shared, sticks: layer.values });
+    images.layer.draw(colour, { ...shared, sticks: layer.values, opaque: true });
     const along = (a) => (about.ends ? [...about.ends[a]].join("–") : AXES[a]);
     bar.textContent = ["red", "green", "blue"].slice(0, dimension).map((name, a) => `${name}: along ${along(a)}`).join(", ");
   } else {
     layer.span ??= quantiles(count, (n) => layer.values[n], [0.01, 0.98]);
     const scale = scaleOf("grey", ...layer.span);
-    images.layer.draw(byScale(scale, (node) => layer.values[node]), shared);
+    images.layer.draw(byScale(scale, (node) => layer.values[node]), { ...shared, opaque: true });
     showBar(bar, scale);
   }
 }

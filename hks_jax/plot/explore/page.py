@@ -73,7 +73,8 @@ def explore(
         path: the file of the page; its folder is created.
         maps: additional maps (*shape) by name.
         anatomy: (*shape) an anatomical image at the nodes of a grid (`hks_jax.io.sample_image`), which lies in grey
-            under the maps and around the domain; NaN where it has no value. A slider sets the opacity of the maps.
+            under the signature and the distances, and around the domain; NaN where it has no value. A slider sets the
+            opacity of the signature and the distances.
         labels: (*shape) integers that define regions, 0 for none.
         label_names: the names of the labels.
         title: the page's title.
