@@ -13,8 +13,6 @@ from jaxtyping import Array
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.compilation import jit_quickly, numpy_where_known
 from hks_jax.eigen.adjoints.adjoint import Adjoint, OfRows, Rows, Scalar, Values, Vectors, unsolved
-from hks_jax.eigen.adjoints.factorised_adjoint import InteriorAdjoint
-from hks_jax.eigen.lanczos.block_lanczos import first_from_origin
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.rotations import gaps
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report
@@ -33,20 +31,19 @@ _ON_HOST = 1 << 22
 """The largest total size of eigenvectors at which NumPy computes derivatives as fast as compiled JAX code does."""
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0, 2, 3, 4, 5, 6))
+@partial(jax.custom_jvp, nondiff_argnums=(0, 2, 3, 4, 5))
 def solved(
-    solver: Eigensolver, pencil: SymmetricPencil, k: int, extra: int, interior: bool, throw: bool, report: Report
+    solver: Eigensolver, pencil: SymmetricPencil, k: int, extra: int, throw: bool, report: Report
 ) -> tuple[Values, Vectors, Scalar, Scalar]:
-    """Return k eigenvalues, the frame of their eigenvectors, the next eigenvalue, and a certified bound.
+    """Return the k lowest eigenvalues, the frame of their eigenvectors, the next eigenvalue, and a certified bound.
 
-    The pairs are the k lowest eigenpairs or, if ``interior``, the first k above the origin of a `LocatedPencil`. The
-    frame is equal to the eigenvectors, but its derivative excludes rotations of the k eigenvectors among themselves,
-    which `hks_jax.eigen.rotations` adds. The next eigenvalue is infinite unless ``extra`` = 1. The solver certifies
-    that none of the k eigenvalues is missing below the bound. Derivatives treat the next eigenvalue and the bound as
-    constants. Derivatives whose linear solves do not converge are NaN, and raise an error if ``throw`` is set, or else
-    cause a warning if values are concrete.
+    The frame is equal to the eigenvectors, but its derivative excludes rotations of the k eigenvectors among
+    themselves, which `hks_jax.eigen.rotations` adds. The next eigenvalue is infinite unless ``extra`` = 1. The solver
+    certifies that none of the k eigenvalues is missing below the bound. Derivatives treat the next eigenvalue and the
+    bound as constants. Derivatives whose linear solves do not converge are NaN, and raise an error if ``throw`` is set,
+    or else cause a warning if values are concrete.
     """
-    values, vectors, complete_below = _computed(solver, pencil, k, extra, interior, report)
+    values, vectors, complete_below = _computed(solver, pencil, k + extra, report)
     return *_cut(values, vectors, k), complete_below
 
 
@@ -61,17 +58,15 @@ def solved(
 #
 # on the M-orthogonal complement of all computed eigenvectors Φ, where K − λᵢM is positive definite. Reverse mode uses
 # the symmetry of the map fᵢ ↦ xᵢ. Because of the guard pairs, λᵢ is not close to the eigenvalues on the complement of
-# Φ. In the interior of a spectrum, the complement of Φ has eigenvalues on both sides of λᵢ. So in the interior, at most
-# half of the guard pairs lie below the origin, and the others follow the k pairs.
+# Φ.
 @solved.defjvp
 def _solved_jvp(
-    solver: Eigensolver, k: int, extra: int, interior: bool, throw: bool, report: Report, primals: Any, changes: Any
+    solver: Eigensolver, k: int, extra: int, throw: bool, report: Report, primals: Any, changes: Any
 ) -> tuple[tuple, tuple]:
     pencil, change = first_order_only(primals[0]), changes[0]
-    n_dof, sides = pencil.size, 2 if interior else 1
-    spare = max(extra, min(sides * solver.guards(k, n_dof), solver.max_pairs(n_dof) - k))
-    values, vectors, complete_below = _computed(solver, pencil, k, spare, interior, report)
-    adjoint = InteriorAdjoint(solver.adjoint.tolerance) if interior else solver.adjoint
+    n_dof, adjoint = pencil.size, solver.adjoint
+    spare = max(extra, min(solver.guards(k, n_dof), solver.max_pairs(n_dof) - k))
+    values, vectors, complete_below = _computed(solver, pencil, k + spare, report)
     # Data from `prepare` do not depend on the pencil's tangent, so all products with one Jacobian share these data.
     prepared = one_by_one(_prepare, (adjoint, k), pencil, values) if _solves(pencil, k, len(values)) else None
     if isinstance(pencil, Pencil):
@@ -84,12 +79,8 @@ def _solved_jvp(
     return (eigenvalues, functions, *constants), (*tangents, *map(jnp.zeros_like, constants))
 
 
-def _computed(
-    solver: Eigensolver, pencil: SymmetricPencil, k: int, spare: int, interior: bool, report: Report
-) -> RawPairs:
-    if interior:
-        return one_by_one(first_from_origin, (solver, k, spare, report), pencil)
-    values, vectors, bound = one_by_one(_lowest, (solver, k + spare, report), pencil)
+def _computed(solver: Eigensolver, pencil: SymmetricPencil, k: int, report: Report) -> RawPairs:
+    values, vectors, bound = one_by_one(_lowest, (solver, k, report), pencil)
     if pencil.null_space is not None and pencil.n_null:
         values, vectors = _with_null_modes(pencil.mass, pencil.null_space.vectors, values, vectors)
     return values, vectors, bound

@@ -36,8 +36,6 @@ _UNCERTAIN = 5
 """The number of consecutive uncertain counts after which a bracket is not divided further."""
 _JUST_BELOW = 0.625
 """The exponent p of the first shift −ε^p λ of a search, where λ is an estimate of the largest eigenvalue."""
-_ALIKE = 1e-3
-"""The relative width of a bracket below which all eigenvalues in it count as one multiple eigenvalue."""
 _NARROW = 8
 """The width at which a bracket is not divided further, in units of the distance of the first shift from zero."""
 
@@ -151,60 +149,16 @@ def _counted(pencil: SymmetricPencil, dissection: Dissection, shift: Scalar) -> 
 
 
 class LocatedPencil(SymmetricPencil):
-    """The pencil of K − σ₀M and M, with counts of its spectrum near the origin σ₀. Its null space is unknown."""
+    """The pencil of K − σ₀M and M for an origin σ₀ below the spectrum. Its null space is unknown."""
 
-    negative: Number  # the number of eigenvalues below the origin
     first: Scalar  # the first shift; about the requested number of eigenvalues lie between the origin and it
     spacing: Scalar  # the mean gap of eigenvalues between the origin and `first`
 
 
-def translated(
-    pencil: SymmetricPencil, origin: Scalar, negative: Number, first: Scalar, spacing: Scalar
-) -> LocatedPencil:
-    """Return the pencil of K − σ₀M and M, where σ₀ is the origin, with counts of its spectrum near σ₀."""
+def translated(pencil: SymmetricPencil, origin: Scalar, first: Scalar, spacing: Scalar) -> LocatedPencil:
+    """Return the pencil of K − σ₀M and M, where σ₀ is the origin, with the beginning of its spectrum."""
     moved, source = pencil.moved_by(jax.lax.stop_gradient(origin))
-    return LocatedPencil(moved, pencil.mass, *jax.lax.stop_gradient((negative, first, spacing)), source=source)
-
-
-class _Descent(NamedTuple):
-    near: Scalar  # the largest distance below the origin that is known to contain at most ``most`` eigenvalues
-    number: Number  # the number of eigenvalues within the distance `near` below the origin
-    far: Scalar  # the least distance below the origin that is known to contain more than ``most`` eigenvalues
-    next: Scalar  # the distance below the origin at which eigenvalues are counted next
-    tries: Number  # the number of factorisations so far
-    going: Flag  # whether the search goes on
-
-
-def lowered(pencil: LocatedPencil, most: int, probes: int) -> tuple[Scalar, Number]:
-    """Return a distance below the origin, and the number of eigenvalues within it, from ``most``/2 to ``most``.
-
-    The number of eigenvalues is less than ``most``/2 if no more exist below the origin, or if a multiple eigenvalue
-    would raise it above ``most``. Each factorisation is tested with ``probes`` random right-hand sides.
-    """
-    count, dtype = _counting(pencil, probes), pencil.stiffness.dtype
-
-    def step(state: _Descent) -> _Descent:
-        return _descended(state, *count(-state.next), pencil.negative, pencil.spacing, most)
-
-    nothing, none = jnp.zeros((), dtype), jnp.zeros((), int)
-    first, going = 3 / 4 * most * pencil.spacing, (pencil.negative > 0) & (most > 0)
-    start = _Descent(nothing, none, nothing + jnp.inf, first, none, going)
-    state = while_loop(lambda state: state.going, step, start)
-    return state.near, state.number
-
-
-@partial(jax.jit, static_argnames="most")
-def _descended(state: _Descent, count: Number, sound: Flag, negative: Number, spacing: Scalar, most: int) -> _Descent:
-    passed = negative - count
-    nearer, farther = sound & (passed <= most), sound & (passed > most)
-    near, number = jnp.where(nearer, state.next, state.near), jnp.where(nearer, passed, state.number)
-    far = jnp.where(farther, state.next, state.far)
-    following = jnp.where(jnp.isfinite(far), (near + far) / 2, 4 * near)
-    # If the number of eigenvalues within a distance is uncertain, the next distance is slightly larger.
-    following = jnp.where(sound, following, state.next + 1e-2 * (jnp.minimum(far, 2 * state.next) - state.next))
-    few, narrow = (2 * number < most) & (number < negative), far - near <= _ALIKE * jnp.maximum(near, spacing)
-    tries = state.tries + 1
-    return _Descent(near, number, far, following, tries, few & ~narrow & (tries < _TRIES))
+    return LocatedPencil(moved, pencil.mass, *jax.lax.stop_gradient((first, spacing)), source=source)
 
 
 class _Search(NamedTuple):

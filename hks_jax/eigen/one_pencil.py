@@ -1,24 +1,22 @@
-"""Eigenpairs of one pencil, either the lowest or those in an interval, with residuals and convergence flags."""
+"""The lowest eigenpairs of one pencil, with residuals and convergence flags."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from hks_jax.arrays import jax_array
-from hks_jax.checks import real_array, require_count
 from hks_jax.compilation import is_concrete_on_cpu, jit_quickly, numpy_where_known
 from hks_jax.eigen.adjoints.adjoint import Scalar
 from hks_jax.eigen.derivative import solved
 from hks_jax.eigen.eigenpairs import UNCERTAIN, Eigenpairs
-from hks_jax.eigen.inertia import certain_count, count_below, locate, translated
-from hks_jax.eigen.lanczos.block_lanczos import SLICE, BlockLanczos, known_by_weyl
+from hks_jax.eigen.inertia import locate, translated
+from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos, known_by_weyl
 from hks_jax.eigen.quality import allowed_residuals, indistinct, largest, largest_of, measure_pairs, measured_on_host
 from hks_jax.eigen.rotations import with_rotations
 from hks_jax.eigen.shift_invert.matrices import balanced, near_zero
@@ -66,7 +64,7 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
         )
     from_bound = pencil.null_space is None and not solver.indefinite
     if not from_bound and (not isinstance(solver, BlockLanczos) or known_by_weyl(pencil)):
-        found = solved(solver, pencil, k, extra, False, throw, report)
+        found = solved(solver, pencil, k, extra, throw, report)
         return _pairs(pencil, pencil, jnp.zeros((), found[0].dtype), found, solver)
     number, method = k, solver
     if from_bound:
@@ -86,8 +84,8 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
         if from_bound:  # a solver for K ⪰ 0 gets K − σM, where σ is a lower bound of the spectrum
             moved: SymmetricPencil = pencil.counted_from(origin)
         else:
-            moved = translated(pencil, origin, jnp.zeros((), int), reach, spacing)
-        return moved, solved(method, moved, number, min(extra, n_dof - number), False, throw, report)
+            moved = translated(pencil, origin, reach, spacing)
+        return moved, solved(method, moved, number, min(extra, n_dof - number), throw, report)
 
     moved, found = solve(origin, reach, spacing)
     values = jax.lax.stop_gradient(found[0])
@@ -103,66 +101,6 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
         frame = with_rotations(frame, constant, chosen[:, None] & ~chosen[None], None, pencil)
         found = values[:k], frame[:k], jax.lax.stop_gradient(values[k]), bound
     return _pairs(pencil, moved, origin, found, method)
-
-
-class Interval(NamedTuple):
-    """An interval of the spectrum of one pencil."""
-
-    low: Scalar  # the lower end, included
-    high: Scalar  # the upper end, excluded
-    below: Int[Array, ""]  # the number of eigenvalues below `low`
-    held: Int[Array, ""]  # the number of eigenvalues in the interval
-    k: int  # the number of pairs to compute; equal to `held` if values are concrete
-
-
-def solve_interval(
-    pencil: Pencil, interval: Interval, solver: BlockLanczos | Dense, throw: bool, report: Report
-) -> Eigenpairs:
-    """Return the k eigenpairs in an interval."""
-    low, high, below, held, k = interval
-    length, pencil = high - low, _with_balance(pencil)
-    moved = translated(pencil, low, below, length / (2 * max(k / SLICE, 1)), length / max(k, 1))
-    nothing = jnp.zeros((0, pencil.size), low.dtype)
-    found = jnp.zeros(0, low.dtype), nothing, jnp.asarray(jnp.inf, low.dtype), length
-    if k:
-        found = solved(solver, moved, k, 0, True, throw, report)
-    found = *found[:3], jnp.where(held == k, jnp.minimum(found[3], length), jnp.nan)
-    return _pairs(pencil, moved, low, found, solver, lowest=False)
-
-
-def checked_interval(pencil: Pencil, interval: tuple[float, float], k: int | None) -> Interval:
-    """Check a user's interval, as `eigenpairs` documents, and count its eigenvalues; also under `jit`."""
-    ends = real_array("interval", interval).astype(pencil.stiffness.dtype)
-    if ends.shape != (2,):
-        raise ValueError(f"interval: got shape {ends.shape}; expected the ends (a, b)")
-    low, high = ends
-    if is_traced((pencil, low, high)):
-        if k is None:
-            raise ValueError(
-                "k: got None, and values are traced; expected the number of eigenvalues in the interval. "
-                "Call `count_eigenvalues` at both ends, outside jax.jit"
-            )
-        require_count("k", k)
-        below, above = (certain_count(pencil, end)[0] for end in (low, high))
-        return Interval(low, high, below, above - below, int(k))
-    if not float(low) < float(high):
-        raise ValueError(f"interval: got ({float(low):g}, {float(high):g}); expected (a, b) with a < b, both finite")
-    try:
-        below, above = (count_below(pencil, end) for end in (low, high))
-    except ValueError as error:
-        raise ValueError(f"interval: {str(error).removeprefix('below: ')}") from None
-    held = above - below
-    count = int(held)
-    if k is not None and k != count:
-        raise ValueError(f"k: got {k}; expected {count}, the number of eigenvalues in the interval. Leave k out")
-    needed = 4 * count * pencil.size * low.dtype.itemsize
-    available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    if needed > available:
-        raise ValueError(
-            f"interval: got one with {count} eigenpairs, which need about {needed / 1e9:.3g} GB; the machine "
-            f"has {available / 1e9:.3g} GB. Divide the interval"
-        )
-    return Interval(low, high, below, held, count)
 
 
 def _with_balance(pencil: Pencil) -> Pencil:
@@ -184,19 +122,14 @@ def _pairs(
     origin: Scalar,
     found: tuple[Any, ...],
     solver: Eigensolver,
-    lowest: bool = True,
 ) -> Eigenpairs:
     """Return the `Eigenpairs` of a pencil, given the pairs of K − σ₀M and M for an origin σ₀."""
     values, frame, following, bound = found
     known = solved_pencil is pencil and pencil.null_space is not None
-    if values.size:
-        matrices = tabulated(SymmetricPencil(solved_pencil.stiffness, solved_pencil.mass))
-        held = jax.lax.stop_gradient((matrices, values, frame, origin))
-        stored = solver.in_double and _single_on_host(values, held)
-        quality = _quality(*held, solved_pencil.n_null, solver.tolerance, known, stored)
-    else:
-        no = jnp.zeros(0, bool)
-        quality = jnp.zeros(0, values.dtype), no, no, jnp.asarray(1e-6, values.dtype)
+    matrices = tabulated(SymmetricPencil(solved_pencil.stiffness, solved_pencil.mass))
+    held = jax.lax.stop_gradient((matrices, values, frame, origin))
+    stored = solver.in_double and _single_on_host(values, held)
+    quality = _quality(*held, solved_pencil.n_null, solver.tolerance, known, stored)
     residuals, converged, zero, tolerance = quality
     constants = jax.lax.stop_gradient((solved_pencil, frame, values, origin, zero))
     small, rounding = _near_zero(*constants, known, solver)
@@ -213,13 +146,12 @@ def _pairs(
         kept=jax_array(np.ones(values.size, bool)),
         next_eigenvalue=following,
         complete_below=bound,
-        spectral_origin=origin if known or not lowest else jax.lax.stop_gradient(values[0]),
+        spectral_origin=origin if known else jax.lax.stop_gradient(values[0]),
         multiplet_tolerance=tolerance,
         part=None,
         frame=frame,
         pencil=pencil,
         solver_name=solver.name,
-        lowest=lowest,
     )
 
 
@@ -245,7 +177,7 @@ def _near_zero(
     In float32, eigenvalues that are zero within rounding may be accurate in float64, in which the host computes.
     """
     nothing = jax_array(np.zeros(values.shape, values.dtype))
-    if values.dtype != np.float32 or not values.size:
+    if values.dtype != np.float32:
         return nothing, nothing
     if not _single_on_host(values, (pencil, vectors, values)):
         return nothing, nothing if known else jnp.where(zero, indistinct(pencil, values.dtype), 0)

@@ -116,8 +116,6 @@ def hks(
         raise ValueError(f'method: got {method!r}; expected "spectral", "spectrum-free" or "auto"')
     times = times_of(pairs, times)
     require_number("tolerance", tolerance, 1)
-    if not pairs.lowest:
-        raise ValueError('method: got "spectrum-free" for pairs in an interval; expected "spectral"')
     return _scaled(pairs, times, normalisation, hks_spectrum_free(pairs.pencil, times, tolerance=tolerance))
 
 

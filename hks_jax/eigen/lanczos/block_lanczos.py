@@ -5,14 +5,12 @@ from functools import partial
 from typing import ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hks_jax.checks import require_count
 from hks_jax.compilation import jit_quickly
-from hks_jax.eigen.adjoints.adjoint import Values, Vectors
-from hks_jax.eigen.inertia import LocatedPencil, Number, dissected, lowered, translated
+from hks_jax.eigen.inertia import LocatedPencil, dissected
 from hks_jax.eigen.lanczos.slicing import cut, search
 from hks_jax.eigen.lanczos.slicing_state import Plan, Problem, SlicingState, Stored, first_state, unfinished
 from hks_jax.eigen.quality import measure_pairs
@@ -59,7 +57,7 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
             require_count("slice_size", self.slice_size)
 
     def lowest(self, pencil: SymmetricPencil, k: int, report: Report = silent) -> RawPairs:
-        """Return the k lowest eigenpairs; for a `LocatedPencil`, the first k above its origin."""
+        """Return the k lowest eigenpairs, and the bound below which inertia certifies that none is missing."""
         plan = self.plan(k, min(pencil.n_null, k))
         problem, dissection = expected(pencil, plan), dissected(pencil)
         if not is_traced(problem):
@@ -78,10 +76,7 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
         if is_traced(bound) or (state.finished and not math.isnan(bound)) or pencil.size > _DENSE:
             return values, vectors, bound
         report("slicing missed pairs: computing all pairs with the dense solver")
-        first = int(pencil.negative) if isinstance(pencil, LocatedPencil) else 0
-        values, vectors, bound = Dense().lowest(pencil, first + k)
-        at = first + jnp.arange(k)  # indices beyond the end give NaN
-        return values.at[at].get(mode="fill"), vectors.at[at].get(mode="fill"), bound
+        return Dense().lowest(pencil, k)
 
     def max_pairs(self, n_dof: int) -> int:
         """Return the largest k that leaves room for a Lanczos basis."""
@@ -102,17 +97,17 @@ def known_by_weyl(pencil: SymmetricPencil) -> bool:
 
 @jit_quickly(static_argnames="plan")
 def expected(pencil: SymmetricPencil, plan: Plan) -> Problem:
-    """Return the pencil with estimates of its spectrum, from the counts of a `LocatedPencil` or from Weyl's law."""
+    """Return the pencil with estimates of its spectrum, from a `LocatedPencil` or from Weyl's law."""
     if isinstance(pencil, LocatedPencil):
         spacing = pencil.spacing
-        return Problem(pencil, pencil.first, spacing, spacing, spacing, pencil.negative)
+        return Problem(pencil, pencil.first, spacing, spacing, spacing)
     assert isinstance(pencil, Pencil)
     assert pencil.volume is not None
     n, dtype = pencil.space.dimension, pencil.stiffness.dtype
     first, several, lowest = (
         weyl(j, pencil.volume, n).astype(dtype) for j in (min(plan.wanted, plan.slice_size) / 2 + 1, plan.slice_size, 1)
     )
-    return Problem(pencil, first, several / plan.slice_size, lowest, jnp.zeros((), dtype), jnp.zeros((), int))
+    return Problem(pencil, first, several / plan.slice_size, lowest, jnp.zeros((), dtype))
 
 
 @jit_quickly(static_argnames="k")
@@ -126,29 +121,3 @@ def _lowest(
     if values.dtype == jnp.float32:
         bound = jnp.where(jnp.any(measure_pairs(pencil, vectors, values)[2] & known), jnp.nan, bound)
     return jnp.where(known, values, jnp.nan), jnp.where(known[:, None], vectors, jnp.nan), bound
-
-
-def first_from_origin(solver: Eigensolver, k: int, guards: int, report: Report, pencil: LocatedPencil) -> RawPairs:
-    """Return the first k pairs above the origin, then guard pairs: the next pairs above, and pairs below the origin.
-
-    If the spectrum has too few guards, the remaining guards are zero vectors with the eigenvalue of the first pair.
-    """
-    if isinstance(solver, Dense):
-        values, vectors, bound = solver.lowest(pencil, pencil.size)
-        values, vectors = _from(pencil.negative, pencil.size, values, vectors)
-        return values[: k + guards], vectors[: k + guards], bound
-    if guards == 0:
-        return solver.lowest(pencil, k, report)
-    assert isinstance(solver, BlockLanczos)
-    distance, before = lowered(pencil, guards // 2, solver.block)
-    moved = translated(pencil, -distance, pencil.negative - before, pencil.first + distance, pencil.spacing)
-    values, vectors, bound = solver.lowest(moved, k + guards, report)
-    return *_from(before, pencil.size - moved.negative, values - distance, vectors), bound - distance
-
-
-@jax.jit
-def _from(first: Number, existing: Number | int, values: Values, vectors: Vectors) -> tuple[Values, Vectors]:
-    """Rotate the order of the pairs until pair ``first`` comes first; pairs that do not exist become zero vectors."""
-    there = jnp.arange(values.size) < existing
-    values, vectors = jnp.where(there, values, values[first]), jnp.where(there[:, None], vectors, 0)
-    return jnp.roll(values, -first), jnp.roll(vectors, -first, axis=0)
