@@ -10,7 +10,6 @@ from hks_jax.checks import require_static
 from hks_jax.eigen.automatic import choose_solvers
 from hks_jax.eigen.doubled import solve_doubled
 from hks_jax.eigen.eigenpairs import RESULTS, SPARE, Eigenpairs, MultipletChoice, truncate
-from hks_jax.eigen.inertia import checked_pencil
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
 from hks_jax.eigen.one_pencil import solve_lowest, widened
 from hks_jax.eigen.shift_invert.shift_invert import ShiftInvert
@@ -19,6 +18,7 @@ from hks_jax.fem.assembly import MassKind
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.elements import Quadrature
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil
+from hks_jax.fem.sparse_input import pencil_of
 from hks_jax.traced import is_traced
 
 
@@ -81,7 +81,7 @@ def eigenpairs(
         >>> print((hj.eigenpairs(flat, k=4).eigenvalues / jnp.pi**2).round(1))  # m² + n² on the unit square
         [0. 1. 1. 2.]
     """
-    pencil = checked_pencil(domain, boundary, mass, quadrature)
+    pencil = pencil_of(domain, boundary, mass, quadrature)
     if multiplet not in get_args(MultipletChoice):
         raise ValueError(f'multiplet: got {multiplet!r}; expected "report", "drop" or "complete"')
     total = sum(part.size for part in pencil.parts)

@@ -14,15 +14,12 @@ from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.quality import largest
 from hks_jax.fem.assembly import MassKind
 from hks_jax.fem.boundary import BoundarySpec
-from hks_jax.fem.elements import Quadrature
 from hks_jax.fem.pencil import AnyPencil
-from hks_jax.fem.space import MatrixSpace
 from hks_jax.fem.sparse_input import pencil_of
 from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.factorised_matrix import certain_factorisation
 from hks_jax.linear.loops import while_loop
 from hks_jax.linear.multifrontal import factorise, try_out
-from hks_jax.linear.operators import DiagonalOperator, PatternedOperator
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.traced import is_traced
 
@@ -75,24 +72,7 @@ def count_eigenvalues(
         5 5
     """
     require_number("below", below, above=-math.inf)
-    return count_below(checked_pencil(domain, boundary, mass), below)
-
-
-def checked_pencil(domain: Any, boundary: BoundarySpec, mass: MassKind, quadrature: Quadrature = "gauss") -> AnyPencil:
-    """Return the pencil of a user's domain. If the user's M is concrete, check that it is positive definite."""
-    pencil = pencil_of(domain, boundary, mass, quadrature)
-    for part in jax.lax.stop_gradient(pencil).parts:
-        own = isinstance(part.space, MatrixSpace) or part.volume is None
-        if not own or isinstance(part.mass, DiagonalOperator) or is_traced(part):
-            continue
-        assert isinstance(part.mass, PatternedOperator)
-        ones, zero = jnp.ones(part.size, part.mass.dtype), jnp.zeros((), part.mass.dtype)
-        negative, sound = certain_count(SymmetricPencil(part.mass, DiagonalOperator(ones)), zero)
-        if int(negative) or not sound:
-            what = f"{int(negative)} negative eigenvalue(s)" if sound else "an eigenvalue that is zero within rounding"
-            name = "M" if isinstance(part.space, MatrixSpace) else "mass"
-            raise ValueError(f"{name}: got a matrix with {what} by its inertia; expected a positive definite matrix")
-    return pencil
+    return count_below(pencil_of(domain, boundary, mass), below)
 
 
 def count_below(pencil: AnyPencil, below: Scalar | float) -> Number:
@@ -146,19 +126,6 @@ def _counted(pencil: SymmetricPencil, dissection: Dissection, shift: Scalar) -> 
     """Return the result of `certain_count`, and the rate of `Trial`."""
     factor, trial, _ = certain_factorisation(dissection, pencil, shift)
     return factor.negative, trial.sound, trial.rate
-
-
-class LocatedPencil(SymmetricPencil):
-    """The pencil of K − σ₀M and M for an origin σ₀ below the spectrum. Its null space is unknown."""
-
-    first: Scalar  # the first shift; about the requested number of eigenvalues lie between the origin and it
-    spacing: Scalar  # the mean gap of eigenvalues between the origin and `first`
-
-
-def translated(pencil: SymmetricPencil, origin: Scalar, first: Scalar, spacing: Scalar) -> LocatedPencil:
-    """Return the pencil of K − σ₀M and M, where σ₀ is the origin, with the beginning of its spectrum."""
-    moved, source = pencil.moved_by(jax.lax.stop_gradient(origin))
-    return LocatedPencil(moved, pencil.mass, *jax.lax.stop_gradient((first, spacing)), source=source)
 
 
 class _Search(NamedTuple):

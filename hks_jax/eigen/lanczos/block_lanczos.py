@@ -10,11 +10,11 @@ from jaxtyping import Array, Float
 
 from hks_jax.checks import require_count
 from hks_jax.compilation import jit_quickly
-from hks_jax.eigen.inertia import LocatedPencil, dissected
+from hks_jax.eigen.inertia import Scalar, dissected, locate
 from hks_jax.eigen.lanczos.slicing import cut, search
 from hks_jax.eigen.lanczos.slicing_state import Plan, Problem, SlicingState, Stored, first_state, unfinished
-from hks_jax.eigen.quality import measure_pairs
-from hks_jax.eigen.solver import Dense, Eigensolver, RawPairs, Report, silent
+from hks_jax.eigen.quality import indistinct, measure_pairs
+from hks_jax.eigen.solver import FAR, Dense, Eigensolver, RawPairs, Report, silent
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.loops import when, while_loop
@@ -25,6 +25,8 @@ SLICE = 170
 """The number of eigenvalues per slice. More slices take more factorisations, but less orthogonalisation."""
 _DENSE = 3000
 """The largest number of unknowns for which the dense solver takes over if slicing fails."""
+_COPIES = 1000
+"""The largest number of lowest eigenvalues that are all computed because rounding does not separate them."""
 
 
 class BlockLanczos(Eigensolver[SymmetricPencil]):
@@ -58,10 +60,33 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
 
     def lowest(self, pencil: SymmetricPencil, k: int, report: Report = silent) -> RawPairs:
         """Return the k lowest eigenpairs, and the bound below which inertia certifies that none is missing."""
-        plan = self.plan(k, min(pencil.n_null, k))
-        problem, dissection = expected(pencil, plan), dissected(pencil)
+        # Weyl's law predicts the beginning and density of some spectra; for the others, inertia is needed.
+        if isinstance(pencil, Pencil) and pencil.measured and pencil.null_space is not None:
+            plan = self.plan(k, min(pencil.n_null, k))
+            return self._by_slices(expected(pencil, plan), plan, report)
+        half = max(self.plan(k).slice_size // 2, 1)
+        origin, first, below = locate(pencil, half, self.block)
+        reach, number = first - origin, k
+        if not is_traced(below) and 2 * half < below <= _COPIES:
+            # The lowest eigenvalue has an unexpectedly high multiplicity. Compute all pairs that `locate` counted.
+            number = max(k, int(below))
+            if number > self.max_pairs(pencil.size):
+                return Dense().lowest(pencil, k)
+        plan, moved = self.plan(number), _moved(pencil, origin, reach, reach / jnp.maximum(below, 1))
+        values, vectors, bound = self._by_slices(moved, plan, report)
+        spread = values[-1] - values[0]
+        if not is_traced(values) and spread > indistinct(pencil, values.dtype) and values[0] > FAR * spread:
+            # Solve again from an origin nearer to the spectrum, because distances of eigenvalues from a remote origin
+            # have fewer correct digits. If all eigenvalues are equal, the lost digits do not matter.
+            origin = origin + values[0] - spread
+            moved = _moved(pencil, origin, 2 * spread, spread / number)
+            values, vectors, bound = self._by_slices(moved, plan, report)
+        return values[:k] + origin, vectors[:k], bound + origin
+
+    def _by_slices(self, problem: Problem, plan: Plan, report: Report) -> RawPairs:
+        k, dissection = plan.wanted, dissected(problem.pencil)
         if not is_traced(problem):
-            problem = problem._replace(pencil=tabulated(pencil))
+            problem = problem._replace(pencil=tabulated(problem.pencil))
 
         def step(both: tuple[SlicingState, Stored]) -> tuple[SlicingState, Stored]:
             factor, searchable, both = cut(problem, dissection, plan, *both)
@@ -72,11 +97,11 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
             return both
 
         state, stored = while_loop(lambda both: unfinished(plan, both[0]), step, first_state(problem, plan))
-        values, vectors, bound = _lowest(pencil, state.values, stored, state.complete_below, k)
-        if is_traced(bound) or (state.finished and not math.isnan(bound)) or pencil.size > _DENSE:
+        values, vectors, bound = _lowest(problem.pencil, state.values, stored, state.complete_below, k)
+        if is_traced(bound) or (state.finished and not math.isnan(bound)) or problem.pencil.size > _DENSE:
             return values, vectors, bound
         report("slicing missed pairs: computing all pairs with the dense solver")
-        return Dense().lowest(pencil, k)
+        return Dense().lowest(problem.pencil, k)
 
     def max_pairs(self, n_dof: int) -> int:
         """Return the largest k that leaves room for a Lanczos basis."""
@@ -90,24 +115,23 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
         return Plan(k, self.block, size, 3 * slices + 12, self.tolerance / 4, nulls)
 
 
-def known_by_weyl(pencil: SymmetricPencil) -> bool:
-    """Return whether Weyl's law predicts the beginning and density of the spectrum; otherwise inertia is needed."""
-    return isinstance(pencil, Pencil) and pencil.measured and pencil.null_space is not None
-
-
 @jit_quickly(static_argnames="plan")
-def expected(pencil: SymmetricPencil, plan: Plan) -> Problem:
-    """Return the pencil with estimates of its spectrum, from a `LocatedPencil` or from Weyl's law."""
-    if isinstance(pencil, LocatedPencil):
-        spacing = pencil.spacing
-        return Problem(pencil, pencil.first, spacing, spacing, spacing)
-    assert isinstance(pencil, Pencil)
+def expected(pencil: Pencil, plan: Plan) -> Problem:
+    """Return the pencil with estimates of its spectrum from Weyl's law."""
     assert pencil.volume is not None
     n, dtype = pencil.space.dimension, pencil.stiffness.dtype
     first, several, lowest = (
         weyl(j, pencil.volume, n).astype(dtype) for j in (min(plan.wanted, plan.slice_size) / 2 + 1, plan.slice_size, 1)
     )
     return Problem(pencil, first, several / plan.slice_size, lowest, jnp.zeros((), dtype))
+
+
+@jit_quickly()
+def _moved(pencil: SymmetricPencil, origin: Scalar, first: Scalar, spacing: Scalar) -> Problem:
+    """Return the pencil of K − σ₀M and M for an origin σ₀ below the spectrum, with the beginning of its spectrum."""
+    moved, source = pencil.moved_by(origin)
+    spacing = spacing.astype(origin.dtype)
+    return Problem(SymmetricPencil(moved, pencil.mass, source=source), first, spacing, spacing, spacing)
 
 
 @jit_quickly(static_argnames="k")
