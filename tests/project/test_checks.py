@@ -64,7 +64,6 @@ def test_counts_of_solvers(solver, name, value):
 
 
 OTHERS = {
-    "tolerance of hks": ("tolerance", lambda v: hj.hks(pairs(), [1.0], method="spectrum-free", tolerance=v)),
     "tolerance of hks_auto": ("tolerance", lambda v: hj.hks_auto(pairs(), [1.0], tolerance=v)),
     "tolerance of hks_spectrum_free": (
         "tolerance",

@@ -216,7 +216,7 @@ def test_a_geometry_that_is_lacking_is_named():
     with pytest.raises(ValueError, match="problem: got matrices without dimension or volume"):
         hj.weyl_count(pairs, [1.0])
     with pytest.raises(ValueError, match="domain: got a stiffness K that may be indefinite"):
-        hj.hks(pairs, TIMES, method="spectrum-free")
+        hj.hks_spectrum_free(pairs.pencil, TIMES)
 
 
 def test_what_sparse_pencil_refuses():
