@@ -54,8 +54,9 @@ OPTIONS = f"""
 {OF_MESHES}
 --map FILE
     a map or a series of maps (4D): NIfTI, MRtrix, NRRD or .npy on the voxels of FILE; for a mesh GIFTI, FreeSurfer's
-    maps (lh.thickness, lh.curv, …) or .npy, one value per vertex. NaN marks unmeasured voxels or vertices: the modes
-    are fitted to the others by least squares. Zeros are values. Values outside the mask are not used
+    maps (lh.thickness, lh.curv, …), .npy, or a mesh with arrays, one value per vertex. NaN marks unmeasured voxels or
+    vertices: the modes are fitted to the others by least squares. Zeros are values. Values outside the mask are not
+    used
 @view
 """
 

@@ -5,9 +5,9 @@ tensors D: more along fibres than across them, and only within the mask. The dif
 mean full width at half maximum is --fwhm, in mm. The integral of the map is kept, except with dirichlet.
 
 FILE has the maps: on the voxels of the tensors (NIfTI, MRtrix, NRRD or .npy), or with --mesh at the vertices of a
-surface or of tetrahedra (GIFTI, FreeSurfer's maps such as lh.thickness, or .npy). On a surface, maps are smoothed
-within it by the tangential parts of the tensors, and without tensors equally in all its directions. The options on
-voxels and on the meaning of numbers refer to the tensors.
+surface or of tetrahedra (GIFTI, FreeSurfer's maps such as lh.thickness, .npy, or a mesh with arrays). On a surface,
+maps are smoothed within it by the tangential parts of the tensors, and without tensors equally in all its directions.
+The options on voxels and on the meaning of numbers refer to the tensors.
 
 The command writes to the folder OUT: smoothed.npz, an image in the tensors' format (smoothed.nii.gz, .nrrd or .vti) or
 a mesh (smoothed.vtu; for a GIFTI or FreeSurfer surface also smoothed.func.gii), report.json, and smoothed.png, which

@@ -10,6 +10,7 @@ from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.io.cortex import load_maps
 from hks_jax.io.formats import IMAGES
 from hks_jax.io.masks import at_voxels, image_of
+from hks_jax.io.mesh import WRITTEN, read_mesh_arrays
 from hks_jax.io.volume import TensorVolume
 from hks_jax.storage import existing, reading
 
@@ -18,15 +19,16 @@ def read_maps(path: str | os.PathLike[str], on: TensorVolume | SimplicialMesh) -
     """Read maps for `hks_jax.decompose`: an image or a series (4D) on the voxels of `on`, or arrays at its vertices.
 
     The formats are NIfTI, MRtrix, NRRD and ``.npy``, and for meshes GIFTI (``.func.gii``, ``.shape.gii``), FreeSurfer's
-    maps (``lh.thickness``, ``lh.curv``, …, recognised by their first bytes) and ``.npy``; in ``.npy`` the maps are
-    (*shape), or (*shape, n) for a volume and (n, V) for a mesh. If both images have affines, each voxel of `on` must
-    coincide with a voxel of the maps, and maps for a slice may cover the whole volume.
+    maps (``lh.thickness``, ``lh.curv``, …, recognised by their first bytes), ``.npy``, and all scalar arrays at the
+    vertices of ``.vtu``, ``.vtk``, ``.msh`` and ``.ply``. In ``.npy`` the maps are (*shape), or (*shape, n) for a
+    volume and (n, V) for a mesh. If both images have affines, each voxel of `on` must coincide with a voxel of the
+    maps, and maps for a slice may cover the whole volume.
 
     Raises:
         FileNotFoundError: the file does not exist.
         ValueError: the kind of file is unknown, or the maps are on other voxels (the message has both affines), or have
             another number of vertices.
-        ImportError: nibabel (for NIfTI, GIFTI and FreeSurfer's maps) or pynrrd (for NRRD) is missing.
+        ImportError: an optional library is missing; the message gives the command that installs it.
 
     Examples:
         >>> volume = hj.io.TensorVolume(np.array(field.tensors), field.grid.spacing, field.grid.origin)
@@ -51,15 +53,17 @@ def read_maps(path: str | os.PathLike[str], on: TensorVolume | SimplicialMesh) -
 
 
 def _at_vertices(path: Path, n: int) -> Float[np.ndarray, "m V"]:
-    values = load_maps(path)
-    if values is None:
-        if not path.name.lower().endswith(".npy"):
-            raise ValueError(
-                f"{path}: the kind of file is unknown; expected .gii or .npy with values at the vertices, or one of "
-                "FreeSurfer's maps, such as lh.thickness"
-            )
+    values, name = load_maps(path), path.name.lower()
+    if values is None and name.endswith(".npy"):
         with reading(path, "a readable .npy file"):
             values = list(np.atleast_2d(np.load(path)))
+    elif values is None and name.endswith(tuple(WRITTEN)):
+        values = [array.ravel() for array in read_mesh_arrays(path).values() if array.size == len(array)]
+    elif values is None:
+        raise ValueError(
+            f"{path}: the kind of file is unknown; expected .gii, .npy, {', '.join(WRITTEN)} with values at the "
+            "vertices, or one of FreeSurfer's maps, such as lh.thickness"
+        )
     if not values or any(array.shape != (n,) for array in values):
         shapes = ", ".join(sorted({str(array.shape) for array in values})) or "no arrays of values"
         raise ValueError(f"{path}: got {shapes}; expected one number for each of the {n} vertices")
