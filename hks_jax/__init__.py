@@ -32,7 +32,7 @@ from hks_jax.domain.grid import Grid as Grid
 from hks_jax.domain.simplicial_mesh import SurfaceMesh as SurfaceMesh
 from hks_jax.domain.simplicial_mesh import TetMesh as TetMesh
 from hks_jax.domain.tensor_field import TensorField as TensorField
-from hks_jax.eigen.adjoints.adjoint import Adjoint as Adjoint
+from hks_jax.eigen.adjoints.complement import Adjoint as Adjoint
 from hks_jax.eigen.adjoints.factorised_adjoint import FactorisedAdjoint as FactorisedAdjoint
 from hks_jax.eigen.driver import eigenpairs as eigenpairs
 from hks_jax.eigen.driver import eigsh as eigsh

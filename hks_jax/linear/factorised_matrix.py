@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.arrays import jax_array
+from hks_jax.arrays import Scalar, jax_array
 from hks_jax.checks import real_array
 from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.multifrontal import Factorisation, Trial, eliminate, factorise, try_out
@@ -36,7 +36,6 @@ _SEARCHED, _TURNS = 16, 4
 """The largest number of null vectors that an error message reports, and the number of iterations that compute them."""
 
 
-Scalar = Float[Array, ""]
 Columns = Float[Array, "n m"]
 
 

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Inexact, Int
 
+from hks_jax.arrays import Scalar
 from hks_jax.compilation import jit_quickly
 from hks_jax.linear import lapack
 from hks_jax.linear.dissection import Dissection, Level, Merged
@@ -26,7 +27,6 @@ from hks_jax.linear.symmetric_inverse import symmetric_inverses
 CONTRACTION = 0.1
 """The largest convergence rate of iterative refinement at which the inertia of a factorisation is accepted."""
 
-Scalar = Float[Array, ""]
 Blocks = tuple[Array, ...]
 """A batch of dense blocks for each level."""
 

@@ -14,8 +14,7 @@ from fields import flat, random_spd
 import hks_jax as hj
 from hks_jax.eigen.lanczos import krylov_basis as bases
 from hks_jax.eigen.lanczos.block_lanczos import expected
-from hks_jax.eigen.lanczos.slicing import cut, search
-from hks_jax.eigen.lanczos.slicing_state import Plan, crowded, first_state, make_room
+from hks_jax.eigen.lanczos.slicing import Plan, crowded, cut, first_state, make_room, search
 from hks_jax.linear import accelerators
 from hks_jax.linear.dissection import dissect
 from hks_jax.linear.multifrontal import factorise

@@ -12,7 +12,7 @@ from jax.sharding import Mesh, NamedSharding
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.checks import require_count
-from hks_jax.eigen.adjoints.adjoint import Adjoint
+from hks_jax.eigen.adjoints.complement import Adjoint
 from hks_jax.eigen.filter.coarsening import coarsen
 from hks_jax.eigen.filter.filtered_adjoint import FilteredAdjoint
 from hks_jax.eigen.filter.polynomial import upper_end

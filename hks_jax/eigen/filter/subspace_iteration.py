@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Int
 
+from hks_jax.arrays import Scalar
 from hks_jax.eigen.filter import subspace
 from hks_jax.eigen.filter.coarsening import interpolate
 from hks_jax.eigen.filter.polynomial import Band, correction
@@ -37,7 +38,6 @@ eigenvalue for all λ above twice that eigenvalue."""
 _MOST_TERMS = 15
 """The maximal number of terms, after the first, of the Neumann series of the inverse mass."""
 
-Scalar = Float[Array, ""]
 Number = Int[Array, ""]
 Values = Float[Array, " m"]
 OwnRows = Float[Array, "own nodes"]

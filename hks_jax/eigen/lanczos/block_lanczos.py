@@ -11,8 +11,7 @@ from jaxtyping import Array, Float
 from hks_jax.checks import require_count
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.inertia import Scalar, dissected, locate
-from hks_jax.eigen.lanczos.slicing import cut, search
-from hks_jax.eigen.lanczos.slicing_state import Plan, Problem, SlicingState, Stored, first_state, unfinished
+from hks_jax.eigen.lanczos.slicing import Plan, Problem, SlicingState, Stored, cut, first_state, search, unfinished
 from hks_jax.eigen.quality import indistinct, measure_pairs
 from hks_jax.eigen.solver import FAR, Dense, Eigensolver, RawPairs, Report, silent
 from hks_jax.eigen.weyl import weyl
