@@ -18,8 +18,7 @@ from hks_jax.cli.demo import B_MAX, RIM
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from browser import Browser
 
-BOUNDARY, PAIRS = "mean", 400
-LENGTHS = np.geomspace(4, 40, 24)  # √(Dt), mm
+BOUNDARY, PAIRS, TIMES = "mean", 600, 24
 
 
 def write_page(path: Path) -> None:
@@ -30,12 +29,12 @@ def write_page(path: Path) -> None:
     plane = replace(plane, mask=hj.io.erode(plane.inside, RIM))
     grid = plane.grid("largest")
     field = hj.TensorField.from_diffusion(grid, plane.tensors.astype(float), metric="inverse")
-    diffusivity = np.median(np.trace(plane.tensors[grid.inside], axis1=-2, axis2=-1)) / 2
-    times = LENGTHS**2 / diffusivity
     pairs = hj.eigenpairs(field, PAIRS, boundary=BOUNDARY)
+    times = np.asarray(hj.default_times(pairs, TIMES))
     values, eigenvalues = (np.asarray(array) for array in (hj.hks(pairs, times), pairs.eigenvalues))
     report = {"settings": {"metric": "inverse", "boundary": BOUNDARY}}
-    result = hj.io.Result(plane.with_mask(grid.mask), values, times, eigenvalues, report)
+    arrays = {"influence": np.asarray(hj.boundary_influence(pairs, times))}
+    result = hj.io.Result(plane.with_mask(grid.mask), values, times, eigenvalues, report, arrays)
     hj.plot.explore(result, path, title="A brain slice")
 
 
