@@ -87,8 +87,8 @@ def read_mesh_arrays(
 ) -> dict[str, Float[np.ndarray, "n *components"]]:
     """Read the named arrays at the vertices or the cells of a mesh, such as tensors or the signatures of `save`.
 
-    Only ``.vtk``, ``.vtu``, ``.vtp``, ``.msh`` and ``.ply`` have arrays; other files give an empty result. Arrays at
-    the cells of polygonal data (``.vtp``, and polygonal data in ``.vtk``) are not read.
+    Only ``.vtk``, ``.vtu``, ``.vtp``, ``.msh`` and ``.ply`` have arrays; other files give an empty result. Arrays in
+    ``.msh`` may lack values at some vertices or cells; there the result is NaN.
 
     Args:
         path: the file.
