@@ -246,6 +246,7 @@ def _lines(description: dict[str, Any]) -> list[str]:
         lines.append(
             f"metric {name:<8} t ≥ {first} for a discretisation error of 1 % (needs {takes}); t ≥ {own} for "
             f"k = {s['k']}; t ≤ {last}, at which about half of the nodes are free of the boundary"
+            + ". No t satisfies both: the domain has too few nodes" * (s["largest_time"] < s["least_time"])
         )
         if name == "inverse":
             lines.append("operator fick   the same t and k as for the metric inverse")

@@ -147,6 +147,11 @@ def test_the_times_that_info_names_are_those_of_the_spectrum(tmp_path, capsys):
     depth = (a + b - np.sqrt(a**2 + b**2)) / 4  # (a − 2d)(b − 2d) = ab/2, and exp(−d²/t) = 1/10
     assert suits["largest_time"] == pytest.approx(depth**2 / np.log(10), rel=0.1)
     assert suits["least_time"] == pytest.approx(6 * max(2 * 0.1**2, 0.5 * 0.2**2))
+    for nodes, told in (80, False), (20, True):  # a sixteenth of the area, with the same spacing
+        np.savez(tmp_path / "n.npz", tensors=metric[: 3 * nodes // 4, :nodes], spacing=[0.1, 0.2])
+        assert main(["info", str(tmp_path / "n.npz")]) == 0
+        (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("metric tensor"))
+        assert line.endswith("No t satisfies both: the domain has too few nodes") == told
     needed = np.searchsorted(eigenvalues, 4.6 / suits["least_time"])
     assert suits["k_for_least_time"] == pytest.approx(needed, rel=0.2)
 
