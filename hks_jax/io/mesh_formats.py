@@ -144,7 +144,7 @@ def _joined(library: Any, content: bytes, pieces: list[re.Match[bytes]]) -> Any:
 
 
 _COUNTS = {
-    ".vtk": (rb"\bPOINTS\s+(-?\d+)", rb"\bCELL_TYPES\s+(-?\d+)"),
+    ".vtk": (rb"\bPOINTS\s+(-?\d+)\s+[a-zA-Z]", rb"\bCELL_TYPES\s+(-?\d+)[ \t]*[\r\n]"),
     ".vtu": (rb"NumberOfPoints\s*=\s*[\"'](-?\d+)", rb"NumberOfCells\s*=\s*[\"'](-?\d+)"),
 }
 """Patterns of the declared numbers of points and cells in each format. For .stl, meshio checks the file's length."""

@@ -198,6 +198,10 @@ def test_info_of_invalid_tensors_and_meshes(tmp_path, capsys):
     volume = f"volume            {float(hj.assemble(ball).volume):.5g}"
     for line in ("vertices          147", "tetrahedra        540", "boundary vertices 92", volume):
         assert f"{line}\n" in text
+    sphere = hj.examples.sphere_mesh(6)
+    meshio.Mesh(np.asarray(sphere.vertices), [("triangle", np.asarray(sphere.faces))]).write(tmp_path / "s.vtu")
+    assert main(["info", str(tmp_path / "s.vtu")]) == 0
+    assert capsys.readouterr().out.endswith(", at which √t is half of the largest extent\n")  # it has no boundary
     assert "absent.nii: no such file" in error_of(capsys, ["info", str(tmp_path / "absent.nii")])
 
 
