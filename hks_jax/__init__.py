@@ -69,9 +69,9 @@ from hks_jax.signatures.distances import varadhan_distance as varadhan_distance
 from hks_jax.signatures.flow import gaussian_scale_space as gaussian_scale_space
 from hks_jax.signatures.flow import heat_flow as heat_flow
 from hks_jax.signatures.flow import tensor_invariants as tensor_invariants
-from hks_jax.signatures.hks import AutomaticHKS as AutomaticHKS
 from hks_jax.signatures.hks import hks as hks
-from hks_jax.signatures.hks import hks_auto as hks_auto
+from hks_jax.signatures.hks_auto import AutomaticHKS as AutomaticHKS
+from hks_jax.signatures.hks_auto import hks_auto as hks_auto
 from hks_jax.signatures.kernels import heat_kernel as heat_kernel
 from hks_jax.signatures.kernels import heat_trace as heat_trace
 from hks_jax.signatures.kernels import scale_invariant_hks as scale_invariant_hks

@@ -86,7 +86,6 @@ CALLS: dict[str, Callable[[], Any]] = {
     "degenerate_points": lambda: hj.degenerate_points(hj.examples.degenerate_point_field(0.5, 9)),
     "diffusion_distance": lambda: hj.diffusion_distance(pairs(), TIMES, SOURCE),
     "eigenpairs": lambda: [hj.eigenpairs(field(), 5, solver=name) for name in ("dense", "shift-invert")],
-    "eigenpairs in an interval": lambda: hj.eigenpairs(field(), interval=(0.1, 0.7)),
     "eigh": lambda: hj.eigh(MATRIX),
     "eigsh": lambda: hj.eigsh(MATRIX, k=2),
     "energy": lambda: hj.energy(pairs(), TENSORS[..., 0, 0]),

@@ -19,7 +19,7 @@ from hks_jax.fem.boundary import BoundarySpec, default_boundary, unreached_sides
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result
 from hks_jax.io.units import median_mean_diffusivity
-from hks_jax.signatures.hks import HKSMethod, Normalisation
+from hks_jax.signatures.hks import Normalisation
 from hks_jax.signatures.rim import estimate_of, free_share, influence_of, is_estimated, is_known, rim_of
 from hks_jax.signatures.spans import SHORTEST, resolved_span
 from hks_jax.signatures.times import FREE, default_k, times_of
@@ -51,7 +51,7 @@ class Settings:
     components: Literal["raise", "largest", "all"]
     solver: str
     normalisation: Normalisation
-    method: HKSMethod
+    method: Literal["spectral", "auto"]
     dtype: Literal["float32", "float64"]
 
     @classmethod
@@ -219,7 +219,7 @@ def solve(pencil: hj.Pencil | hj.MirrorPencil, settings: Settings, progress: Pro
 def _signature(pairs: hj.Eigenpairs, times: tuple[float, ...], settings: Settings) -> tuple[np.ndarray, dict[str, Any]]:
     """Return the signature and, for the method ``"auto"``, the entry of the report about the methods used."""
     if settings.method != "auto":
-        return np.asarray(hj.hks(pairs, times, settings.normalisation, settings.method)), {}
+        return np.asarray(hj.hks(pairs, times, settings.normalisation)), {}
     result = hj.hks_auto(pairs, times, settings.normalisation)
     origin: dict[str, Any] = {"eigenpairs": [], result.method: [], "agreement": None}
     for t, spectral in zip(times, np.asarray(result.spectral), strict=True):

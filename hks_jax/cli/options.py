@@ -101,9 +101,9 @@ file FILE...
 --normalisation raw|heat-trace|volume|flat = flat
     normalisation of the signature: flat is (4πt)^(d/2)·HKS, which is 1 for flat space (default), raw is HKS itself,
     volume is HKS times the volume of the domain, and heat-trace is HKS divided by its integral
---method spectral|spectrum-free|auto = spectral
-    method: a sum over eigenpairs (default), a computation without eigenpairs, or a choice by t, k and the spacing. For
-    auto, the report lists the times of each method and their agreement
+--method spectral|auto = spectral
+    method: a sum over eigenpairs (default), or for auto a computation without eigenpairs at times that are too small
+    for them. For auto, the report lists the times of each method and their agreement
 [noise] error bars
 --noise NOISE
     noise of the tensors, for error bars: a number relative to the mean diffusivity, such as 0.1; residuals, for the

@@ -13,8 +13,6 @@ from jaxtyping import Array
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.compilation import jit_quickly, numpy_where_known
 from hks_jax.eigen.adjoints.adjoint import Adjoint, OfRows, Rows, Scalar, Values, Vectors, unsolved
-from hks_jax.eigen.adjoints.factorised_adjoint import InteriorAdjoint
-from hks_jax.eigen.lanczos.block_lanczos import first_from_origin
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.rotations import gaps
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report
@@ -33,20 +31,19 @@ _ON_HOST = 1 << 22
 """The largest total size of eigenvectors at which NumPy computes derivatives as fast as compiled JAX code does."""
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0, 2, 3, 4, 5, 6))
+@partial(jax.custom_jvp, nondiff_argnums=(0, 2, 3, 4, 5))
 def solved(
-    solver: Eigensolver, pencil: SymmetricPencil, k: int, extra: int, interior: bool, throw: bool, report: Report
+    solver: Eigensolver, pencil: Pencil, k: int, extra: int, throw: bool, report: Report
 ) -> tuple[Values, Vectors, Scalar, Scalar]:
-    """Return k eigenvalues, the frame of their eigenvectors, the next eigenvalue, and a certified bound.
+    """Return the k lowest eigenvalues, the frame of their eigenvectors, the next eigenvalue, and a certified bound.
 
-    The pairs are the k lowest eigenpairs or, if ``interior``, the first k above the origin of a `LocatedPencil`. The
-    frame is equal to the eigenvectors, but its derivative excludes rotations of the k eigenvectors among themselves,
-    which `hks_jax.eigen.rotations` adds. The next eigenvalue is infinite unless ``extra`` = 1. The solver certifies
-    that none of the k eigenvalues is missing below the bound. Derivatives treat the next eigenvalue and the bound as
-    constants. Derivatives whose linear solves do not converge are NaN, and raise an error if ``throw`` is set, or else
-    cause a warning if values are concrete.
+    The frame is equal to the eigenvectors, but its derivative excludes rotations of the k eigenvectors among
+    themselves, which `hks_jax.eigen.rotations` adds. The next eigenvalue is infinite unless ``extra`` = 1. The solver
+    certifies that none of the k eigenvalues is missing below the bound. Derivatives treat the next eigenvalue and the
+    bound as constants. Derivatives whose linear solves do not converge are NaN, and raise an error if ``throw`` is set,
+    or else cause a warning if values are concrete.
     """
-    values, vectors, complete_below = _computed(solver, pencil, k, extra, interior, report)
+    values, vectors, complete_below = _computed(solver, pencil, k + extra, report)
     return *_cut(values, vectors, k), complete_below
 
 
@@ -61,35 +58,32 @@ def solved(
 #
 # on the M-orthogonal complement of all computed eigenvectors Φ, where K − λᵢM is positive definite. Reverse mode uses
 # the symmetry of the map fᵢ ↦ xᵢ. Because of the guard pairs, λᵢ is not close to the eigenvalues on the complement of
-# Φ. In the interior of a spectrum, the complement of Φ has eigenvalues on both sides of λᵢ. So in the interior, at most
-# half of the guard pairs lie below the origin, and the others follow the k pairs.
+# Φ.
 @solved.defjvp
 def _solved_jvp(
-    solver: Eigensolver, k: int, extra: int, interior: bool, throw: bool, report: Report, primals: Any, changes: Any
+    solver: Eigensolver, k: int, extra: int, throw: bool, report: Report, primals: Any, changes: Any
 ) -> tuple[tuple, tuple]:
     pencil, change = first_order_only(primals[0]), changes[0]
-    n_dof, sides = pencil.size, 2 if interior else 1
-    spare = max(extra, min(sides * solver.guards(k, n_dof), solver.max_pairs(n_dof) - k))
-    values, vectors, complete_below = _computed(solver, pencil, k, spare, interior, report)
-    adjoint = InteriorAdjoint(solver.adjoint.tolerance) if interior else solver.adjoint
-    # Data from `prepare` do not depend on the pencil's tangent, so all products with one Jacobian share these data.
-    prepared = one_by_one(_prepare, (adjoint, k), pencil, values) if _solves(pencil, k, len(values)) else None
-    if isinstance(pencil, Pencil):
-        # Metric and density are removed: derivatives do not need them, and reverse mode would store their arrays.
-        pencil = replace(pencil, metric=None, density=None)
-    on_failure: OnFailure = "error" if throw else "nothing" if is_traced(primals) else "warning"
+    n_dof, adjoint = pencil.size, solver.adjoint
+    spare = max(extra, min(solver.guards(k, n_dof), solver.max_pairs(n_dof) - k))
+    values, vectors, complete_below = _computed(solver, pencil, k + spare, report)
     eigenvalues, functions, following = _cut(values, vectors, k)
-    tangents = tangents_of(adjoint, on_failure, prepared, pencil, change, values, vectors, functions)
+    origin, solves = jnp.zeros((), values.dtype), _solves(pencil, k, len(values))
+    if solves and pencil.null_space is None:  # linear solves need K ⪰ 0
+        origin = _below(values, indistinct(pencil, values.dtype))
+        pencil, values = pencil.counted_from(origin), values - origin
+    # Data from `prepare` do not depend on the pencil's tangent, so all products with one Jacobian share these data.
+    prepared = one_by_one(_prepare, (adjoint, k), pencil, values) if solves else None
+    # Metric and density are removed: derivatives do not need them, and reverse mode would store their arrays.
+    pencil = replace(pencil, metric=None, density=None)
+    on_failure: OnFailure = "error" if throw else "nothing" if is_traced(primals) else "warning"
+    tangents = tangents_of(adjoint, on_failure, prepared, pencil, origin, change, values, vectors, functions)
     constants = following if extra else jnp.full_like(following, jnp.inf), complete_below
     return (eigenvalues, functions, *constants), (*tangents, *map(jnp.zeros_like, constants))
 
 
-def _computed(
-    solver: Eigensolver, pencil: SymmetricPencil, k: int, spare: int, interior: bool, report: Report
-) -> RawPairs:
-    if interior:
-        return one_by_one(first_from_origin, (solver, k, spare, report), pencil)
-    values, vectors, bound = one_by_one(_lowest, (solver, k + spare, report), pencil)
+def _computed(solver: Eigensolver, pencil: Pencil, k: int, report: Report) -> RawPairs:
+    values, vectors, bound = one_by_one(_lowest, (solver, k, report), pencil)
     if pencil.null_space is not None and pencil.n_null:
         values, vectors = _with_null_modes(pencil.mass, pencil.null_space.vectors, values, vectors)
     return values, vectors, bound
@@ -98,6 +92,13 @@ def _computed(
 @numpy_where_known(static_argnums=2)
 def _cut(xp: Any, values: Any, vectors: Any, k: int) -> tuple[Any, Any, Any]:
     return values[:k], vectors[:k], values[k] if len(values) > k else xp.asarray(xp.inf, values.dtype)
+
+
+@numpy_where_known()
+def _below(xp: Any, values: Any, rounding: Any) -> Any:
+    """Return the lowest eigenvalue minus the mean gap or, if all eigenvalues are equal, minus some rounding errors."""
+    gap = (values[-1] - values[0]) / values.size
+    return values[0] - xp.where(gap > rounding, gap, 1e3 * rounding)
 
 
 def _solves(pencil: SymmetricPencil, k: int, p: int) -> bool:
@@ -112,12 +113,12 @@ def _shapes(*args: Any) -> tuple[Any, Any]:
 
 def _numpy_rule(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
     """Compute `tangents_of` by NumPy; if cotangents y of its result are given, compute the cotangent of ``change``."""
-    adjoint, on_failure, prepared, pencil, _, *pairs = known
+    adjoint, on_failure, prepared, pencil, origin, _, *pairs = known
     values, vectors, functions = map(np.asarray, pairs)
     if vectors.size > _ON_HOST or x is None:
         return None
-    change, k = x[4], len(functions)
-    eigenvalues, guards = values[:k, None], vectors[k:]
+    change, k = x[5], len(functions)
+    eigenvalues, guards = (values[:k] + np.asarray(origin))[:, None], vectors[k:]
     _, inverse = gaps(np, values, k, np.asarray(indistinct(pencil, values.dtype)))
 
     def outside(rhs: np.ndarray) -> np.ndarray:
@@ -158,6 +159,7 @@ def tangents_of(
     on_failure: OnFailure,
     prepared: Any,
     pencil: SymmetricPencil,
+    origin: Scalar,
     change: SymmetricPencil,
     values: Values,
     vectors: Vectors,
@@ -165,11 +167,12 @@ def tangents_of(
 ) -> tuple[OfRows, Rows]:
     """Return the tangents of the first k of p computed eigenvalues, and of the frame of `solved`.
 
-    ``prepared`` is the result of `Adjoint.prepare`. ``functions`` are the first k vectors, passed separately because
-    slicing ``vectors`` would copy the slice.
+    ``prepared`` is the result of `Adjoint.prepare`. ``pencil`` and ``values`` are those of K − σM for the ``origin`` σ;
+    ``change`` is that of K and M. ``functions`` are the first k vectors, passed separately because slicing ``vectors``
+    would copy the slice.
     """
     k = len(functions)
-    eigenvalues, guards = values[:k], vectors[k:]
+    eigenvalues, guards = values[:k] + origin, vectors[k:]
     moved = change.mass.apply(functions)
     force = change.stiffness.apply(functions) - eigenvalues[:, None] * moved
     _, inverse = gaps(jnp, values, k, indistinct(pencil, values.dtype))

@@ -104,7 +104,6 @@ def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: i
         frame=jnp.concatenate(rows)[lowest] / math.sqrt(len(solved)),
         pencil=pencil,
         solver_name=" + ".join(dict.fromkeys(pairs.solver_name for pairs in solved)),
-        lowest=solved[0].lowest,
     )
 
 
@@ -116,7 +115,7 @@ def _sorted_by(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...]) -> list[Flo
     keys: list[Array] = []
     for pairs, including in zip(solved, pencil.including, strict=True):
         own = pairs.eigenvalues
-        for j in including[:-1] if pairs.lowest else ():
+        for j in including[:-1]:
             both = min(len(own), len(keys[j]))
             own = own.at[:both].max(keys[j][:both])
         keys.append(own)
@@ -134,7 +133,7 @@ def _complete_below(
     bounds = []
     for pairs, limit in zip(solved, _limits(pencil, total), strict=True):
         bound = pairs.complete_below
-        if pairs.k < pairs.space.n_dof and pairs.lowest:
+        if pairs.k < pairs.space.n_dof:
             last = pairs.eigenvalues[-1]
             beyond = jnp.maximum(last, reach[0]) if pairs.k >= limit else last
             bound = jnp.where(bound >= last, beyond, bound)

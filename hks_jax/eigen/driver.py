@@ -7,24 +7,24 @@ import numpy as np
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import require_static
-from hks_jax.eigen.automatic import choose_solver, choose_solvers
-from hks_jax.eigen.doubled import merge, solve_doubled
+from hks_jax.eigen.automatic import choose_solvers
+from hks_jax.eigen.doubled import solve_doubled
 from hks_jax.eigen.eigenpairs import RESULTS, SPARE, Eigenpairs, MultipletChoice, truncate
-from hks_jax.eigen.inertia import checked_pencil
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
-from hks_jax.eigen.one_pencil import Interval, checked_interval, solve_interval, solve_lowest, widened
+from hks_jax.eigen.one_pencil import solve_lowest, widened
 from hks_jax.eigen.shift_invert.shift_invert import ShiftInvert
-from hks_jax.eigen.solver import Dense, Eigensolver, Report, silent
+from hks_jax.eigen.solver import Eigensolver, Report, silent
 from hks_jax.fem.assembly import MassKind
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.elements import Quadrature
-from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
+from hks_jax.fem.pencil import AnyPencil, MirrorPencil
+from hks_jax.fem.sparse_input import pencil_of
 from hks_jax.traced import is_traced
 
 
 def eigenpairs(
     domain: Any,
-    k: int | None = None,
+    k: int,
     boundary: BoundarySpec = "neumann",
     solver: str | Eigensolver = "auto",
     mass: MassKind = "consistent",
@@ -32,7 +32,6 @@ def eigenpairs(
     throw: bool = False,
     progress: Report | None = None,
     *,
-    interval: tuple[float, float] | None = None,
     quadrature: Quadrature = "gauss",
 ) -> Eigenpairs:
     """Compute the k lowest eigenpairs of the Laplace–Beltrami operator, or of any symmetric pencil Kφ = λMφ.
@@ -44,26 +43,24 @@ def eigenpairs(
     Args:
         domain: a tensor field; a mesh; a pencil from `assemble` or `sparse_pencil`; a symmetric matrix K; or a pair
             (K, M). `sparse_pencil` describes the accepted matrices.
-        k: the number of pairs, from 1 to the number of degrees of freedom. With an interval, leave k out; but if values
-            are traced, k must be the number of eigenvalues in the interval (`count_eigenvalues`).
+        k: the number of pairs, from 1 to the number of degrees of freedom. `count_eigenvalues` gives the k of all
+            eigenvalues below a number.
         boundary: the boundary condition of a field or mesh; see `assemble`.
         solver: ``"auto"`` (a choice by size, but never a solver on the host under `jit`, `vmap` or on accelerators),
             ``"dense"``, ``"shift-invert"`` (on the host), ``"block-lanczos"`` (mainly for 2D and surfaces),
             ``"chebyshev-filter"`` (for grids, mainly in 3D), or a solver object such as
-            ``hks_jax.BlockLanczos(tolerance=1e-6)``. The result names the solver in ``.solver_name``. An interval, or a
-            stiffness that may be indefinite, needs ``"dense"`` or ``"block-lanczos"``. For an indefinite stiffness with
-            concrete values, ``"shift-invert"`` works too. For an interval, derivatives use only the tolerance of the
-            solver's ``adjoint``.
+            ``hks_jax.BlockLanczos(tolerance=1e-6)``. The result names the solver in ``.solver_name``. A stiffness that
+            may be indefinite needs ``"dense"`` or ``"block-lanczos"``; with concrete values, ``"shift-invert"`` works
+            too.
         mass: the mass matrix of a field or mesh, ``"consistent"`` or ``"lumped"``.
         multiplet: the treatment of a multiple eigenvalue that k cuts, so that only some of its pairs are among the k
-            lowest; unused with an interval. ``"report"`` warns. ``"drop"`` excludes its pairs from every signature.
-            ``"complete"`` computes 8 more pairs and includes the missing pairs, or drops the eigenvalue if 8 pairs are
-            too few. ``.kept`` marks the included pairs.
+            lowest. ``"report"`` warns. ``"drop"`` excludes its pairs from every signature. ``"complete"`` computes 8
+            more pairs and includes the missing pairs, or drops the eigenvalue if 8 pairs are too few. ``.kept`` marks
+            the included pairs.
         throw: whether to raise an error if ``.result`` is not successful or derivatives do not converge; under `jit`, a
             callback to the host raises the error. Without ``throw``, ``.result`` has the error's code, derivatives that
             did not converge are NaN, and concrete values cause a warning.
         progress: a function such as ``print`` that receives short texts during a computation with concrete values.
-        interval: the ends (a, b) of an interval; all eigenpairs with a ≤ λ < b are computed instead of the lowest.
         quadrature: the quadrature rule for a field or mesh; see `assemble`.
 
     Returns:
@@ -72,8 +69,7 @@ def eigenpairs(
 
     Raises:
         ValueError: k is out of range; the solver, boundary or mass is unknown; the solver does not support the pencil;
-            the stiffness does not annihilate the given null vectors; the mass is not positive definite; the interval is
-            empty, ends at an eigenvalue, or contains more eigenpairs than fit into memory.
+            the stiffness does not annihilate the given null vectors; the mass is not positive definite.
         RuntimeError: the computation failed and ``throw`` is set.
 
     Warns:
@@ -85,23 +81,18 @@ def eigenpairs(
         >>> print((hj.eigenpairs(flat, k=4).eigenvalues / jnp.pi**2).round(1))  # m² + n² on the unit square
         [0. 1. 1. 2.]
     """
-    pencil = checked_pencil(domain, boundary, mass, quadrature)
+    pencil = pencil_of(domain, boundary, mass, quadrature)
     if multiplet not in get_args(MultipletChoice):
         raise ValueError(f'multiplet: got {multiplet!r}; expected "report", "drop" or "complete"')
-    report = progress or silent
-    if interval is not None:
-        pairs = _in_interval(pencil, interval, k, solver, throw, report)
-    else:
-        total = sum(part.size for part in pencil.parts)
-        require_static("k", k)
-        number = np.asarray(k)
-        if number.ndim or number.dtype.kind not in "iuf" or number != number // 1 or not 1 <= number <= total:
-            raise ValueError(
-                f"k: got {k}; expected an integer from 1 to {total}, the number of degrees of freedom. "
-                "Use a smaller k or a finer grid"
-            )
-        pairs = _lowest(pencil, int(number), solver, multiplet, throw, report)
-    pairs = pairs.on(pencil)
+    total = sum(part.size for part in pencil.parts)
+    require_static("k", k)
+    number = np.asarray(k)
+    if number.ndim or number.dtype.kind not in "iuf" or number != number // 1 or not 1 <= number <= total:
+        raise ValueError(
+            f"k: got {k}; expected an integer from 1 to {total}, the number of degrees of freedom. "
+            "Use a smaller k or a finer grid"
+        )
+    pairs = _lowest(pencil, int(number), solver, multiplet, throw, progress or silent).on(pencil)
     known = jax.lax.stop_gradient(pairs)
     if is_traced(known.eigenvalues):
         return known.result.error_if(pairs, known.result != RESULTS.successful) if throw else pairs
@@ -116,33 +107,31 @@ def eigenpairs(
 def eigsh(
     K: Any,
     M: Any = None,
-    k: int | None = None,
+    k: int = 6,
     *,
-    interval: tuple[float, float] | None = None,
     solver: str | Eigensolver | None = None,
     throw: bool = False,
     progress: Report | None = None,
 ) -> Eigenpairs:
-    """Compute the lowest eigenpairs of a sparse symmetric pencil, or all in an interval; certify that none is missing.
+    """Compute the k lowest eigenpairs of a sparse symmetric pencil, and certify that none is missing.
 
     ``eigsh(K, M, k)`` equals ``eigenpairs(sparse_pencil(K, M), k)``. The function corresponds to
     `scipy.sparse.linalg.eigsh` with ``which="LM"`` and ``sigma`` below the spectrum, but needs no shift. K may be
     singular, with any null space, or indefinite. Eigenvectors are the *rows* of ``.vectors``. Multiple eigenvalues are
     found with their full multiplicity. If values are traced, an eigenvalue of multiplicity above about forty may lack
-    pairs; then ``.result`` is not successful. For the largest eigenvalues, negate K; for interior eigenvalues, give the
-    interval. A ``LinearOperator`` is not accepted, because K and M are factorised (by nested dissection).
+    pairs; then ``.result`` is not successful. For the largest eigenvalues, negate K. For all eigenvalues below b, take
+    the k that `count_eigenvalues` returns. A ``LinearOperator`` is not accepted, because K and M are factorised (by
+    nested dissection).
 
     Derivatives with respect to the entries of K and M are those of `eigenpairs`. The derivative of an eigenvector is
     NaN if its eigenvalue is multiple; so do not sum f(λᵢ) φᵢ(x)² yourself, but use `spectral_signature`. The function
-    works under `jit`, and under `vmap` over pencils from `sparse_pencil` that share a sparsity pattern. Derivatives in
-    an interval keep its ends fixed.
+    works under `jit`, and under `vmap` over pencils from `sparse_pencil` that share a sparsity pattern.
 
     Args:
         K: a symmetric (n, n) matrix: a SciPy sparse matrix, a BCOO or BCSR of `jax.experimental.sparse`, an operator of
             this package, or a dense array. Without M, K may also be a pencil from `sparse_pencil` or `assemble`.
         M: a symmetric positive definite matrix of one of these types, or its diagonal (n,); None means the identity.
-        k: the number of pairs, from 1 to n. If an interval is given, see `eigenpairs`.
-        interval: the ends (a, b) of an interval, in which all eigenpairs with a ≤ λ < b are computed.
+        k: the number of pairs, from 1 to n; by default 6, as SciPy's.
         solver: see `eigenpairs`; None means ``"auto"``.
         throw: see `eigenpairs`.
         progress: see `eigenpairs`.
@@ -162,9 +151,7 @@ def eigsh(
         >>> print(hj.eigsh(K, k=3).eigenvalues.round(3))  # 2 − 2 cos(jπ/6)
         [0.268 1. 2. ]
     """
-    return eigenpairs(
-        K if M is None else (K, M), k, solver=solver or "auto", throw=throw, progress=progress, interval=interval
-    )
+    return eigenpairs(K if M is None else (K, M), k, solver=solver or "auto", throw=throw, progress=progress)
 
 
 def _lowest(
@@ -183,34 +170,3 @@ def _lowest(
         if doubtful and (found.unconfirmed or not found.converged.all()):  # for example, if k cuts a large multiplet
             pairs = solve_lowest(pencil, BlockLanczos(), size, extra, throw, report)
     return truncate(pairs, k, multiplet)
-
-
-def _in_interval(
-    pencil: AnyPencil,
-    interval: tuple[float, float],
-    k: int | None,
-    solver: str | Eigensolver,
-    throw: bool,
-    report: Report,
-) -> Eigenpairs:
-    if len(pencil.parts) > 1 and k is not None:
-        raise ValueError(
-            f"k: got {k} with an interval of a doubled domain, whose parts have separate counts; leave k out"
-        )
-    checked = [checked_interval(part, interval, k) for part in jax.lax.stop_gradient(pencil).parts]
-    solvers = [_for_interval(solver, part, each) for part, each in zip(pencil.parts, checked, strict=True)]
-    traced = is_traced([each.below for each in checked])
-    whole = pencil if traced else widened(pencil, solvers, max(int(each.below) + each.k for each in checked))
-    problems = zip(whole.parts, checked, solvers, strict=True)
-    solved = tuple(solve_interval(part, each, method, throw, report) for part, each, method in problems)
-    return merge(whole, solved, sum(pairs.k for pairs in solved), 0) if isinstance(whole, MirrorPencil) else solved[0]
-
-
-def _for_interval(solver: str | Eigensolver, pencil: Pencil, interval: Interval) -> BlockLanczos | Dense:
-    """Return the solver for an interval: `Dense` if the interval has too many eigenvalues for a Lanczos basis."""
-    chosen = choose_solver(solver, pencil, max(interval.k, 1))
-    if solver == "auto" and not isinstance(chosen, BlockLanczos | Dense):
-        chosen = BlockLanczos()
-    if not isinstance(chosen, BlockLanczos | Dense):
-        raise ValueError(f'solver: got {chosen.name!r}; expected "block-lanczos" or "dense" for an interval')
-    return chosen if interval.k + 1 <= chosen.max_pairs(pencil.size) else Dense(chosen.tolerance)

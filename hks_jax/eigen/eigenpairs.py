@@ -45,7 +45,7 @@ class RESULTS(eqx.Enumeration):
 
 
 class Eigenpairs(eqx.Module):
-    """The k lowest eigenpairs of Kφ = λMφ, or all eigenpairs in an interval; a pytree.
+    """The k lowest eigenpairs of Kφ = λMφ; a pytree.
 
     The derivatives of signatures with respect to the matrices use `pencil` and `frame`, not `eigenvalues`. So do not
     rescale `eigenvalues` or `frame`: derivatives of signatures would then refer to the new arrays, not to the matrices.
@@ -53,9 +53,9 @@ class Eigenpairs(eqx.Module):
 
     Attributes:
         eigenvalues: (k,) in ascending order, in 1/(metric length)²; exactly 0 for null vectors.
-        residuals: (k,) ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁), where λ₁ is the first positive eigenvalue. In an interval, or if
-            the null space is unknown, max(λ, λ₁) is replaced by the larger of two numbers: the mean gap of the
-            eigenvalues, and the distance of λ from `spectral_origin`.
+        residuals: (k,) ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁), where λ₁ is the first positive eigenvalue. If the null
+            space is unknown, max(λ, λ₁) is replaced by the larger of two numbers: the mean gap of the eigenvalues, and
+            the distance of λ from `spectral_origin`.
         converged: (k,) whether the residual is at most the solver's tolerance, or at most the level of rounding.
         rounding: (k,) for small eigenvalues of float32 matrices, the error that rounding of the matrices' entries may
             cause; 0 for other eigenvalues, and for eigenvalues that are zero in float64 too. An eigenvalue is small if
@@ -63,13 +63,12 @@ class Eigenpairs(eqx.Module):
             `jit` and on accelerators). Derivatives treat `rounding` as a constant.
         kept: (k,) whether each pair belongs to the truncated spectrum; signatures ignore the other pairs. The choices
             ``multiplet="drop"`` and ``"complete"`` may exclude the last pairs; `of_part` keeps only one part's pairs.
-        next_eigenvalue: the first eigenvalue that is not kept; infinite if it does not exist or was not computed, as
-            for an interval. Derivatives treat `next_eigenvalue` as a constant.
-        complete_below: the bound below which the solver certifies that it missed no eigenvalue (for an interval,
-            between the lower end and the bound), by Sylvester's law of inertia or because it computed all eigenvalues.
-            `complete_below` is NaN without a certificate. Derivatives treat `complete_below` as a constant.
-        spectral_origin: the reference point of relative errors: 0 if K ⪰ 0 is known, otherwise the lowest eigenvalue;
-            for an interval its lower end.
+        next_eigenvalue: the first eigenvalue that is not kept; infinite if it does not exist. Derivatives treat
+            `next_eigenvalue` as a constant.
+        complete_below: the bound below which the solver certifies that it missed no eigenvalue, by Sylvester's law of
+            inertia or because it computed all eigenvalues. `complete_below` is NaN without a certificate. Derivatives
+            treat `complete_below` as a constant.
+        spectral_origin: the reference point of relative errors: 0 if K ⪰ 0 is known, otherwise the lowest eigenvalue.
         multiplet_tolerance: the gap, relative to the distance from `spectral_origin`, below which neighbouring
             eigenvalues count as equal. If the null space is unknown, gaps at the level of rounding count as zero too.
         part: (k,) for the boundaries "mirror" and "mean", the index of the pencil's part that each pair belongs to (0
@@ -79,7 +78,6 @@ class Eigenpairs(eqx.Module):
             rotations by divided differences.
         pencil: the matrices K and M.
         solver_name: the name of the solver.
-        lowest: whether the pairs are the lowest; false for an interval.
     """
 
     eigenvalues: Float[Array, " k"]
@@ -95,7 +93,6 @@ class Eigenpairs(eqx.Module):
     frame: Float[Array, "k n_dof"]
     pencil: AnyPencil
     solver_name: str = eqx.field(static=True)
-    lowest: bool = eqx.field(static=True, default=True)
 
     def __repr__(self) -> str:
         unknowns = sum(part.space.n_dof for part in self.pencil.parts)
@@ -151,9 +148,9 @@ class Eigenpairs(eqx.Module):
 
     @property
     def null_space_known(self) -> bool:
-        """Whether the pairs are the lowest, and the pencils' null spaces are known."""
+        """Whether the pencils' null spaces are known."""
         # `Eigenpairs` in the outcome of a fit have no pencil. A fit is for a tensor field, whose null space is known.
-        return self.lowest and (self.pencil is None or all(part.null_space is not None for part in self.pencil.parts))
+        return self.pencil is None or all(part.null_space is not None for part in self.pencil.parts)
 
     @property
     def n_null(self) -> int:
@@ -175,12 +172,12 @@ class Eigenpairs(eqx.Module):
     @property
     def cut_multiplet(self) -> Array:
         """The number of kept pairs of the multiple eigenvalue that the cut divides; 0 if the cut divides none."""
-        return _cut_multiplet(self._spectrum, self.kept) if self.k else jnp.zeros((), int)
+        return _cut_multiplet(self._spectrum, self.kept)
 
     @property
     def multiplets(self) -> Int[Array, " k"]:
         """The number of the multiple eigenvalue that each eigenvalue belongs to, from 0, as `cut_multiplet` tells."""
-        return _multiplets(self._spectrum) if self.k else jnp.zeros(0, int)
+        return _multiplets(self._spectrum)
 
     @property
     def _spectrum(self) -> "_Spectrum":
@@ -197,9 +194,7 @@ class Eigenpairs(eqx.Module):
 
         If a lower bound of the spectrum is known, no certificate is needed, because some solvers give none.
         """
-        if not self.k:
-            return jnp.zeros((), bool)
-        optional = self.lowest and (self.pencil is None or all(part.bounded for part in self.pencil.parts))
+        optional = self.pencil is None or all(part.bounded for part in self.pencil.parts)
         return _unconfirmed(self._spectrum, self.kept, jax.lax.stop_gradient(self.complete_below), optional)
 
     @property
@@ -219,8 +214,6 @@ class Eigenpairs(eqx.Module):
 
     def messages(self) -> list[str]:
         """Return sentences that describe defects of these pairs. Values must be concrete."""
-        if not self.k:
-            return []
         other = "allow more restarts" if "shift-invert" in self.solver_name else "another solver"
         values, bad = np.asarray(self.eigenvalues), ~np.asarray(self.converged)
         kept, cut = int(np.asarray(self.kept).sum()), int(self.cut_multiplet)
@@ -265,8 +258,7 @@ class Eigenpairs(eqx.Module):
 
     def summary(self) -> str:
         """Describe size, method, range and quality in a few lines. Values must be concrete."""
-        if not require_pairs(self).k:
-            return "no eigenpairs: the interval contains no eigenvalue"
+        require_pairs(self)
         values, residuals = np.asarray(self.eigenvalues), np.asarray(self.residuals)
         kept, following = int(np.asarray(self.kept).sum()), float(self.next_eigenvalue)
         last = values[kept - 1]

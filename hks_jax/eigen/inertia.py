@@ -14,15 +14,12 @@ from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.quality import largest
 from hks_jax.fem.assembly import MassKind
 from hks_jax.fem.boundary import BoundarySpec
-from hks_jax.fem.elements import Quadrature
 from hks_jax.fem.pencil import AnyPencil
-from hks_jax.fem.space import MatrixSpace
 from hks_jax.fem.sparse_input import pencil_of
 from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.factorised_matrix import certain_factorisation
 from hks_jax.linear.loops import while_loop
 from hks_jax.linear.multifrontal import factorise, try_out
-from hks_jax.linear.operators import DiagonalOperator, PatternedOperator
 from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.traced import is_traced
 
@@ -36,8 +33,6 @@ _UNCERTAIN = 5
 """The number of consecutive uncertain counts after which a bracket is not divided further."""
 _JUST_BELOW = 0.625
 """The exponent p of the first shift −ε^p λ of a search, where λ is an estimate of the largest eigenvalue."""
-_ALIKE = 1e-3
-"""The relative width of a bracket below which all eigenvalues in it count as one multiple eigenvalue."""
 _NARROW = 8
 """The width at which a bracket is not divided further, in units of the distance of the first shift from zero."""
 
@@ -77,24 +72,7 @@ def count_eigenvalues(
         5 5
     """
     require_number("below", below, above=-math.inf)
-    return count_below(checked_pencil(domain, boundary, mass), below)
-
-
-def checked_pencil(domain: Any, boundary: BoundarySpec, mass: MassKind, quadrature: Quadrature = "gauss") -> AnyPencil:
-    """Return the pencil of a user's domain. If the user's M is concrete, check that it is positive definite."""
-    pencil = pencil_of(domain, boundary, mass, quadrature)
-    for part in jax.lax.stop_gradient(pencil).parts:
-        own = isinstance(part.space, MatrixSpace) or part.volume is None
-        if not own or isinstance(part.mass, DiagonalOperator) or is_traced(part):
-            continue
-        assert isinstance(part.mass, PatternedOperator)
-        ones, zero = jnp.ones(part.size, part.mass.dtype), jnp.zeros((), part.mass.dtype)
-        negative, sound = certain_count(SymmetricPencil(part.mass, DiagonalOperator(ones)), zero)
-        if int(negative) or not sound:
-            what = f"{int(negative)} negative eigenvalue(s)" if sound else "an eigenvalue that is zero within rounding"
-            name = "M" if isinstance(part.space, MatrixSpace) else "mass"
-            raise ValueError(f"{name}: got a matrix with {what} by its inertia; expected a positive definite matrix")
-    return pencil
+    return count_below(pencil_of(domain, boundary, mass), below)
 
 
 def count_below(pencil: AnyPencil, below: Scalar | float) -> Number:
@@ -148,63 +126,6 @@ def _counted(pencil: SymmetricPencil, dissection: Dissection, shift: Scalar) -> 
     """Return the result of `certain_count`, and the rate of `Trial`."""
     factor, trial, _ = certain_factorisation(dissection, pencil, shift)
     return factor.negative, trial.sound, trial.rate
-
-
-class LocatedPencil(SymmetricPencil):
-    """The pencil of K − σ₀M and M, with counts of its spectrum near the origin σ₀. Its null space is unknown."""
-
-    negative: Number  # the number of eigenvalues below the origin
-    first: Scalar  # the first shift; about the requested number of eigenvalues lie between the origin and it
-    spacing: Scalar  # the mean gap of eigenvalues between the origin and `first`
-
-
-def translated(
-    pencil: SymmetricPencil, origin: Scalar, negative: Number, first: Scalar, spacing: Scalar
-) -> LocatedPencil:
-    """Return the pencil of K − σ₀M and M, where σ₀ is the origin, with counts of its spectrum near σ₀."""
-    moved, source = pencil.moved_by(jax.lax.stop_gradient(origin))
-    return LocatedPencil(moved, pencil.mass, *jax.lax.stop_gradient((negative, first, spacing)), source=source)
-
-
-class _Descent(NamedTuple):
-    near: Scalar  # the largest distance below the origin that is known to contain at most ``most`` eigenvalues
-    number: Number  # the number of eigenvalues within the distance `near` below the origin
-    far: Scalar  # the least distance below the origin that is known to contain more than ``most`` eigenvalues
-    next: Scalar  # the distance below the origin at which eigenvalues are counted next
-    tries: Number  # the number of factorisations so far
-    going: Flag  # whether the search goes on
-
-
-def lowered(pencil: LocatedPencil, most: int, probes: int) -> tuple[Scalar, Number]:
-    """Return a distance below the origin, and the number of eigenvalues within it, from ``most``/2 to ``most``.
-
-    The number of eigenvalues is less than ``most``/2 if no more exist below the origin, or if a multiple eigenvalue
-    would raise it above ``most``. Each factorisation is tested with ``probes`` random right-hand sides.
-    """
-    count, dtype = _counting(pencil, probes), pencil.stiffness.dtype
-
-    def step(state: _Descent) -> _Descent:
-        return _descended(state, *count(-state.next), pencil.negative, pencil.spacing, most)
-
-    nothing, none = jnp.zeros((), dtype), jnp.zeros((), int)
-    first, going = 3 / 4 * most * pencil.spacing, (pencil.negative > 0) & (most > 0)
-    start = _Descent(nothing, none, nothing + jnp.inf, first, none, going)
-    state = while_loop(lambda state: state.going, step, start)
-    return state.near, state.number
-
-
-@partial(jax.jit, static_argnames="most")
-def _descended(state: _Descent, count: Number, sound: Flag, negative: Number, spacing: Scalar, most: int) -> _Descent:
-    passed = negative - count
-    nearer, farther = sound & (passed <= most), sound & (passed > most)
-    near, number = jnp.where(nearer, state.next, state.near), jnp.where(nearer, passed, state.number)
-    far = jnp.where(farther, state.next, state.far)
-    following = jnp.where(jnp.isfinite(far), (near + far) / 2, 4 * near)
-    # If the number of eigenvalues within a distance is uncertain, the next distance is slightly larger.
-    following = jnp.where(sound, following, state.next + 1e-2 * (jnp.minimum(far, 2 * state.next) - state.next))
-    few, narrow = (2 * number < most) & (number < negative), far - near <= _ALIKE * jnp.maximum(near, spacing)
-    tries = state.tries + 1
-    return _Descent(near, number, far, following, tries, few & ~narrow & (tries < _TRIES))
 
 
 class _Search(NamedTuple):

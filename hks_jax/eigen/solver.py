@@ -16,9 +16,12 @@ from hks_jax.checks import require_number
 from hks_jax.compilation import is_concrete_on_cpu
 from hks_jax.eigen.adjoints.adjoint import Adjoint
 from hks_jax.eigen.adjoints.factorised_adjoint import FactorisedAdjoint
-from hks_jax.eigen.shift_invert.matrices import host_matrices
 from hks_jax.linear.dense_eigh import pencil_eigh
+from hks_jax.linear.host_matrices import host_matrices
 from hks_jax.linear.pencil import P, SymmetricPencil
+
+FAR = 30
+"""The largest distance of an origin below the wanted eigenvalues, in units of the spread of these eigenvalues."""
 
 RawPairs = tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, ""]]
 
@@ -51,7 +54,6 @@ class Eigensolver(eqx.Module, Generic[P]):
 
     Attributes:
         name: the name of the method in reports.
-        indefinite: whether the method supports a stiffness that is indefinite, or whose null space is unknown.
         in_double: whether the method computes in float64 if values are concrete and on a CPU, whatever their dtype.
         adjoint: the linear solver for derivatives. The default, `FactorisedAdjoint`, needs a pencil that it can
             factorise.
@@ -60,7 +62,6 @@ class Eigensolver(eqx.Module, Generic[P]):
     """
 
     name: ClassVar[str]
-    indefinite: ClassVar[bool] = True
     in_double: ClassVar[bool] = False
     tolerance: eqx.AbstractVar[float]
     adjoint: Adjoint = eqx.field(default=FactorisedAdjoint(), static=True, kw_only=True)

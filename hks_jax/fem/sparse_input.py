@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental.sparse import BCOO, BCSR
 from jaxtyping import Array, Float, Int
-from scipy.sparse import issparse
+from scipy.sparse import identity, issparse
 from scipy.sparse.linalg import LinearOperator
 
 from hks_jax.arrays import jax_array
@@ -22,6 +22,7 @@ from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.elements import Quadrature
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
 from hks_jax.fem.space import MatrixSpace
+from hks_jax.linear.host_matrices import inertia_on_host
 from hks_jax.linear.operators import ROUNDING, DiagonalOperator, Operator, SparseOperator, require_symmetric
 from hks_jax.linear.pattern import SparsePattern
 from hks_jax.linear.pencil import NullSpace, SymmetricPencil
@@ -115,7 +116,20 @@ def pencil_of(domain: Any, boundary: BoundarySpec, mass: MassKind, quadrature: Q
         domain = eqx.tree_at(lambda p: (p.stiffness, p.mass), domain, symmetric)
     for part in jax.lax.stop_gradient(domain).parts:
         require_null_space(part)
+        _require_definite_mass(part)
     return domain
+
+
+def _require_definite_mass(pencil: Pencil) -> None:
+    """Raise ValueError if the user's own M, in a matrix or a form, is concrete and not positive definite."""
+    own = isinstance(pencil.space, MatrixSpace) or pencil.volume is None
+    if not own or isinstance(pencil.mass, DiagonalOperator) or is_traced(pencil):
+        return
+    negative, sound = inertia_on_host(pencil.mass.to_scipy(), identity(pencil.size), 0.0)
+    if negative or not sound:
+        what = f"{negative} negative eigenvalue(s)" if sound else "an eigenvalue that is zero within rounding"
+        name = "M" if isinstance(pencil.space, MatrixSpace) else "mass"
+        raise ValueError(f"{name}: got a matrix with {what} by its inertia; expected a positive definite matrix")
 
 
 def _checked_null_vectors(pencil: SymmetricPencil, null_vectors: Any) -> Float[Array, "m n"]:

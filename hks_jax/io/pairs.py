@@ -74,6 +74,8 @@ def pairs_of(name: str, arrays: Mapping[str, np.ndarray], pencil: AnyPencil) -> 
     missing = [key for key in (*names, "solver_name") if key not in arrays]
     if missing:
         raise ValueError(f"{name}: the file lacks {', '.join(missing)}; expected a file that save_pairs wrote")
+    if not arrays.get("lowest", True):  # earlier versions wrote such files
+        raise ValueError(f"{name}: got the eigenpairs of an interval; expected the lowest eigenpairs")
     dtype = pencil.parts[0].stiffness.dtype
     values: dict[str, Any] = {
         key: jnp.asarray(a, dtype if a.dtype.kind == "f" else None) for key in names for a in [arrays[key]]
@@ -84,12 +86,11 @@ def pairs_of(name: str, arrays: Mapping[str, np.ndarray], pencil: AnyPencil) -> 
             f"{name}: got eigenfunctions of shape {values['vectors'].shape}; expected {(k, n)} for this pencil. Use "
             "the mask and the boundary with which the pairs were computed"
         )
-    lowest = bool(values.pop("lowest"))
     solver_name = str(np.asarray(arrays["solver_name"]))
     values.setdefault("part", None)
     values.setdefault("rounding", jnp.zeros_like(values["eigenvalues"]))  # older files lack it
     frame = values.pop("vectors")
-    pairs = Eigenpairs(**values, frame=frame, lowest=lowest, pencil=pencil, solver_name=solver_name)
+    pairs = Eigenpairs(**values, frame=frame, pencil=pencil, solver_name=solver_name)
     gap = np.concatenate([_residuals(pairs, number) for number in range(len(pencil.parts))])
     ends = np.array([pairs.next_eigenvalue, *pairs.eigenvalues[-1:], pairs.spectral_origin])
     size = np.max(np.abs(ends[np.isfinite(ends)]))

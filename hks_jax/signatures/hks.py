@@ -1,85 +1,30 @@
-"""The heat kernel signature from eigenpairs, or without them at small times."""
+"""The heat kernel signature from eigenpairs, and its normalisations."""
 
 import math
-import warnings
 from typing import Any, Literal
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from hks_jax.accuracy import AccuracyWarning, warn_of_accuracy
-from hks_jax.arrays import nan_is_meant
-from hks_jax.checks import require_number
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Heat
 from hks_jax.signatures.spectral_functions import spectral_diagonal, spectral_trace
-from hks_jax.signatures.times import dimension_of, measure_of, times_of
-from hks_jax.signatures.truncation import resolved_times, truncation
-from hks_jax.spectrum_free.heat_diagonal import hks_spectrum_free
-from hks_jax.spectrum_free.plan import Unattainable, choose_method, least_work, work
-from hks_jax.traced import is_traced
-
-_DEARER = 10.0
-"""The largest work for comparing the two methods at one time, relative to the work of the spectrum-free method."""
+from hks_jax.signatures.times import dimension_of, measure_of
+from hks_jax.signatures.truncation import resolved_times
 
 Normalisation = Literal["raw", "heat-trace", "volume", "flat"]
-HKSMethod = Literal["spectral", "spectrum-free", "auto"]
-
-
-class AutomaticHKS(eqx.Module):
-    """A heat kernel signature that comes from eigenpairs at some times, and from a spectrum-free method at the others.
-
-    Attributes:
-        values: (n_times, *shape) the signature.
-        times: (n_times,).
-        spectral: (n_times,) bool, whether the signature at a time was computed from eigenpairs.
-        tail: (n_times,) the estimated share of the signature that the eigenpairs lack, which decides the method.
-        method: the spectrum-free method, ``"colouring"`` or ``"selected-inversion"``; ``"none"`` if it was not used.
-        overlap_time: the shortest time from eigenpairs, at which both methods were compared; NaN if they were not.
-        overlap_difference: the greatest difference between the two methods at `overlap_time`, relative to
-            (4πt)^(−d/2); NaN without comparison.
-    """
-
-    values: Float[Array, "n_times *shape"]
-    times: Float[Array, " n_times"]
-    spectral: Bool[Array, " n_times"]
-    tail: Float[Array, " n_times"]
-    method: str = eqx.field(static=True)
-    overlap_time: Float[Array, ""]
-    overlap_difference: Float[Array, ""]
-
-    def summary(self) -> str:
-        """Return a few lines of text with the times of each method and the difference between the methods."""
-        times, spectral = np.asarray(self.times), np.asarray(self.spectral)
-        lines = []
-        for name, which in (("eigenpairs", spectral), (self.method, ~spectral)):
-            some = [f"{t:.4g}" for t in times[which]]
-            if some:
-                listed = ", ".join(some[:8]) + (" …" if len(some) > 8 else "")
-                lines.append(f"{len(some)} of {times.size} times use {name}: {listed}")
-        if math.isfinite(float(self.overlap_time)):
-            lines.append(
-                f"at t = {float(self.overlap_time):.4g} the signatures with and without eigenpairs differ by "
-                f"{float(self.overlap_difference):.1e} · (4πt)^(−d/2)"
-            )
-        return "\n".join(lines)
 
 
 def hks(
     pairs: Eigenpairs,
     times: Any,
     normalisation: Normalisation = "raw",
-    method: HKSMethod = "spectral",
-    tolerance: float = 1e-4,
 ) -> Float[Array, "n_times *shape"]:
     """Compute the heat kernel signature HKS(t, x) = k_t(x, x) = Σᵢ exp(−λᵢt) φᵢ(x)².
 
-    See Sun, Ovsjanikov and Guibas 2009, eq. 5, and Zobel, Reininghaus and Hotz, section 2. The unit of ``"raw"`` is
-    1/(metric length)^d, and 1/length^d for Fick's operator. The signature is NaN outside the mask, and 0 at Dirichlet
-    nodes.
+    See Sun, Ovsjanikov and Guibas 2009, eq. 5, and Zobel, Reininghaus and Hotz, section 2. `hks_auto` and
+    `hks_spectrum_free` reach smaller times. The unit of ``"raw"`` is 1/(metric length)^d, and 1/length^d for Fick's
+    operator. The signature is NaN outside the mask, and 0 at Dirichlet nodes.
 
     Args:
         times: (n_times,) positive, in (metric length)².
@@ -88,15 +33,9 @@ def hks(
             element dx, so that it tends to 1 for large t, except with a potential. ``"flat"`` multiplies it by
             (4πt)^(d/2), or by (4πt)^(d/2) √|D| for Fick's operator, so that it tends to 1 for small t away from the
             boundary, or to 1/ρ with a density ρ. At vertices of a mesh, √|D| is the mean over the cells around them.
-        method: ``"spectral"`` sums over the pairs. ``"spectrum-free"`` uses only the matrices of the pairs (see
-            `hks_spectrum_free`). ``"auto"`` sums over the pairs at times at which the sum is accurate to the tolerance,
-            and uses the matrices at the other times; `hks_auto` also reports its choice.
-        tolerance: the allowed error of ``"spectrum-free"`` and ``"auto"``, relative to (4πt)^(−d/2), with the factor of
-            `hks_spectrum_free` for a potential.
 
     Raises:
-        ValueError: if times are not positive and finite, if the normalisation or the method is unknown, if
-            ``"heat-trace"`` is used without the spectrum, or if ``"auto"`` is used with traced values.
+        ValueError: if times are not positive and finite, or if the normalisation is unknown.
 
     Warns:
         AccuracyWarning: if times are too small for the number of pairs or for the grid (see `truncation`).
@@ -106,111 +45,9 @@ def hks(
         >>> print(signature[1].min().round(3), signature[1].max().round(3))  # heat has spread evenly
         1.0 1.0
     """
-    if method == "spectral":
-        times = resolved_times(pairs, times)
-        scale = None if normalisation == "raw" else _of_times(pairs, times, normalisation)
-        return _of_nodes(pairs, normalisation, spectral_diagonal(pairs, Heat(times), scale))
-    if method == "auto":
-        return hks_auto(pairs, times, normalisation, tolerance).values
-    if method != "spectrum-free":
-        raise ValueError(f'method: got {method!r}; expected "spectral", "spectrum-free" or "auto"')
-    times = times_of(pairs, times)
-    require_number("tolerance", tolerance, 1)
-    if not pairs.lowest:
-        raise ValueError('method: got "spectrum-free" for pairs in an interval; expected "spectral"')
-    return _scaled(pairs, times, normalisation, hks_spectrum_free(pairs.pencil, times, tolerance=tolerance))
-
-
-@nan_is_meant
-def hks_auto(
-    pairs: Eigenpairs, times: Any, normalisation: Normalisation = "raw", tolerance: float = 1e-4
-) -> AutomaticHKS:
-    """Compute the heat kernel signature with the suitable method at each time, and report the choice.
-
-    The signature is computed from the pairs at times at which they lack at most the share `tolerance` of it (by the
-    estimate of `truncation`), and by `hks_spectrum_free` at the other times. If both methods are used, they are
-    compared at the shortest time computed from the pairs, unless the comparison takes more than ten times the work of
-    `hks_spectrum_free` at the other times.
-
-    Args:
-        times: (n_times,) positive; the normalisation is as in `hks`.
-        tolerance: the allowed error of both methods, as in `hks`.
-
-    Raises:
-        ValueError: as in `hks`, or if values are traced, because the choice depends on them.
-
-    Warns:
-        AccuracyWarning: if the methods differ by ten times the tolerance, or if times are too small for the grid.
-
-    Examples:
-        >>> print(hj.hks_auto(pairs, [0.05, 0.5]).spectral)  # the first takes more than 12 pairs
-        [False  True]
-    """
-    require_number("tolerance", tolerance, 1)
-    times = times_of(pairs, times)
-    known_pairs, known_times = jax.lax.stop_gradient((pairs, times))
-    if is_traced((known_pairs.eigenvalues, known_times)):
-        raise ValueError(
-            'method: got "auto" with traced values (jax.jit, vmap), but the choice depends on values; expected '
-            '"spectral" or, for small times, "spectrum-free"'
-        )
-    estimate = truncation(known_pairs, known_times)
-    spectral = np.asarray(estimate.tail) <= tolerance
-    nan = jnp.asarray(np.nan, times.dtype)
-    if spectral.all():
-        values = hks(pairs, times, normalisation)
-        return AutomaticHKS(values, times, jnp.asarray(spectral), estimate.tail, "none", nan, nan)
-    small = np.flatnonzero(~spectral)
-    pencil = pairs.pencil
-    settings = choose_method(pencil, times[small], "auto", tolerance)
-    raw = hks_spectrum_free(pencil, times[small], method=settings or "selected-inversion", tolerance=tolerance)
-    others = _scaled(pairs, times[small], normalisation, raw)
-    # `hks_spectrum_free` uses no eigenpairs, so at its times only the grid can cause a warning.
-    some = jax.tree.map(lambda leaf: leaf[small] if leaf.ndim else leaf, estimate)
-    for message in eqx.tree_at(lambda e: e.tail, some, jnp.zeros(small.size)).messages():
-        warn_of_accuracy(message)
-    values = jnp.zeros((times.size, *others.shape[1:]), others.dtype).at[small].set(others)
-    overlap = difference = nan
-    if spectral.any():
-        large = np.flatnonzero(spectral)
-        of_pairs = hks(pairs, times[large], normalisation)
-        values = values.at[large].set(of_pairs)
-        overlap = jnp.min(known_times[large])
-        least = work(settings, pencil, times[small])
-        difference = _difference(known_pairs, overlap[None], tolerance, _DEARER * least)
-        overlap = jnp.where(jnp.isnan(difference), nan, overlap)
-        if float(difference) > 10 * tolerance:
-            warn_of_accuracy(
-                f"at t = {float(overlap):.4g} the signatures with and without eigenpairs differ by "
-                f"{float(difference):.1e}, more than ten times the tolerance {tolerance:.1e}. Check the pairs' "
-                "residuals",
-            )
-    name = "selected-inversion" if settings is None else "colouring"
-    return AutomaticHKS(values, times, jnp.asarray(spectral), estimate.tail, name, overlap, difference)
-
-
-def _scaled(pairs: Eigenpairs, times: Float[Array, " m"], normalisation: str, values: Array) -> Array:
-    if normalisation == "heat-trace":
-        raise ValueError(
-            'normalisation: got "heat-trace", which needs eigenvalues; use "raw", "volume", "flat" or method="spectral"'
-        )
-    return values * normaliser(pairs, times, normalisation)
-
-
-def _difference(pairs: Eigenpairs, times: Float[Array, " 1"], tolerance: float, most: float) -> Float[Array, ""]:
-    """Return the greatest difference of the signatures with and without pairs, relative to (4πt)^(−d/2), or NaN."""
-    pencil = pairs.pencil
-    try:
-        settings = least_work(pencil, times, tolerance)
-    except Unattainable:
-        return jnp.asarray(np.nan, times.dtype)
-    if work(settings, pencil, times) > most:
-        return jnp.asarray(np.nan, times.dtype)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", AccuracyWarning)
-        spectral = hks(pairs, times)
-        other = hks_spectrum_free(pencil, times, method=settings or "selected-inversion", tolerance=tolerance)
-    return jnp.nanmax(jnp.abs(spectral - other) * normaliser(pairs, times, "flat"))
+    times = resolved_times(pairs, times)
+    scale = None if normalisation == "raw" else _of_times(pairs, times, normalisation)
+    return _of_nodes(pairs, normalisation, spectral_diagonal(pairs, Heat(times), scale))
 
 
 def normaliser(pairs: Eigenpairs, times: Float[Array, " n"], normalisation: str) -> Float[Array, "n *broadcast"]:

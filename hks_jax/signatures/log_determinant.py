@@ -121,8 +121,8 @@ def log_determinant(
         time: T, in (metric length)²; by default the time with the least estimated error.
 
     Raises:
-        ValueError: if there are fewer than d + 1 coefficients, if a power is not positive, if the pairs are not the
-            lowest, if an eigenvalue is negative or none is positive, or if the dimension is not known.
+        ValueError: if there are fewer than d + 1 coefficients, if a power is not positive, if an eigenvalue is negative
+            or none is positive, or if the dimension is not known.
 
     Warns:
         AccuracyWarning: if the estimated error exceeds 0.01.
@@ -141,8 +141,6 @@ def log_determinant(
     powers = np.asarray(extrapolate, float)
     if not (powers > 0).all() or len(set(powers)) != powers.size:
         raise ValueError(f"extrapolate: got {extrapolate}; expected distinct positive powers of t")
-    if not pairs.lowest:
-        raise ValueError("pairs: got eigenpairs in an interval; expected the lowest eigenpairs")
     if not is_traced(pairs.eigenvalues) and (pairs.eigenvalues < 0).any():
         raise ValueError(f"pairs: got the eigenvalue {float(pairs.eigenvalues[0]):.4g}; expected none below zero")
     _, last = jax.lax.stop_gradient(positive_range(pairs))

@@ -152,10 +152,9 @@ def _rows_of(pairs: Eigenpairs, number: int) -> tuple[Int[Array, " m"], Bool[Arr
     """
     if pairs.part is None:
         return None
-    most, own = pairs.k, jax.lax.stop_gradient(pairs.part) == number
-    if pairs.lowest:
-        assert isinstance(pairs.pencil, MirrorPencil)
-        most //= len(pairs.pencil.including[number])
+    assert isinstance(pairs.pencil, MirrorPencil)
+    own = jax.lax.stop_gradient(pairs.part) == number
+    most = pairs.k // len(pairs.pencil.including[number])
     if not is_traced(own):
         step = -(-pairs.k // _SIZES)
         most = min(most, step * -(-int(own.sum()) // step))

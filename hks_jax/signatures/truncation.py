@@ -116,13 +116,13 @@ def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]
     if this gives more than d/2, and the discretisation error is NaN. The error is also NaN for unknown node spacing.
 
     Raises:
-        ValueError: if times are not positive and finite, pairs lie in an interval, or the dimension is not known.
+        ValueError: if times are not positive and finite, or the dimension is not known.
 
     Examples:
         >>> print(hj.truncation(pairs, [0.02, 0.2]).tail < 0.01)  # whether 12 pairs are enough
         [False  True]
     """
-    pairs, at = _estimated(pairs, times)
+    pairs, at = jax.lax.stop_gradient((pairs, times_of(pairs, times)))
     known = pairs.eigenvalues, pairs.kept, pairs.next_eigenvalue, pairs.spectral_origin
     dimension, resolution = dimension_of(pairs, "an estimate of the truncation"), pairs.pencil.resolution
     by_weyl = pairs.null_space_known
@@ -256,23 +256,15 @@ def median_of_shares(xp: Any, x: Any, free: Any) -> Any:
     return xp.where(xp.any(xp.isnan(x), axis=1), xp.nan, median)
 
 
-def _estimated(pairs: Eigenpairs, times: Any) -> tuple[Eigenpairs, Float[Array, " n"]]:
-    """Return pairs and times as constants for derivatives; raise ValueError if the pairs are not the lowest."""
-    at = times_of(pairs, times)
-    if not pairs.lowest:
-        raise ValueError("pairs: got eigenpairs in an interval; truncation can be estimated only for the lowest pairs")
-    return jax.lax.stop_gradient((pairs, at))
-
-
 def resolved_times(pairs: Eigenpairs, times: Any, factor: int = 1) -> Float[Array, " n"]:
     """Return times as `times_of` does; warn if the pairs or the node spacing do not resolve some of the times.
 
-    The factor is 2 if the caller computes exp(−2λt). No warning is issued if values are traced, if pairs lie in an
-    interval (their sums are band-limited on purpose), or if the dimension of the manifold is not known.
+    The factor is 2 if the caller computes exp(−2λt). No warning is issued if values are traced, or if the
+    dimension of the manifold is not known.
     """
     times = times_of(pairs, times)
     known, at = jax.lax.stop_gradient((pairs, times))
-    if not is_traced((known.eigenvalues, known.pencil, at)) and pairs.lowest and pairs.space.dimension is not None:
+    if not is_traced((known.eigenvalues, known.pencil, at)) and pairs.space.dimension is not None:
         estimate = truncation(known, factor * at)
         of_caller = dataclasses.replace(
             estimate,
@@ -359,13 +351,13 @@ def truncation_map(
         times: (n_times,) positive, in (metric length)².
 
     Raises:
-        ValueError: if times are not positive and finite, or if pairs lie in an interval.
+        ValueError: if times are not positive and finite.
 
     Examples:
         >>> print(hj.truncation_map(pairs, [0.2]).max() < 1e-5)  # 12 pairs are enough
         True
     """
-    return _map(*_estimated(pairs, times))
+    return _map(*jax.lax.stop_gradient((pairs, times_of(pairs, times))))
 
 
 @jax.jit

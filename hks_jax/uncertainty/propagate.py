@@ -164,7 +164,7 @@ def uncertainty(
     except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
         raise ValueError(
             "function: got a function of concrete values, which JAX cannot trace; expected a traceable function. "
-            'Pass compiled=False, or avoid choices by values such as hks(…, method="auto")'
+            "Pass compiled=False, or avoid choices by values, as in hks_auto"
         ) from error
     if method == "auto":
         if is_traced((measured, noise.covariance)):

@@ -677,7 +677,7 @@ def test_in_float32_rows_are_grouped_for_the_accuracy_that_there_is():
     dissection = dissect(pencil.pattern)
 
     def first_rows(tolerance, solves=1):
-        return FactorisedAdjoint(tolerance, solves).groups(dissection, 200, 200, np.dtype(np.float32))[0]
+        return FactorisedAdjoint(tolerance, solves)._groups(dissection, 200, 200, np.dtype(np.float32))[0]
 
     asked = first_rows(1e-8)
     np.testing.assert_array_equal(asked, first_rows(attainable(1e-8, np.float32)))

@@ -9,8 +9,8 @@ import hks_jax as hj
 from hks_jax.eigen.adjoints.adjoint import amplification, projected
 from hks_jax.eigen.adjoints.factorised_adjoint import FactorisedAdjoint
 from hks_jax.eigen.shift_invert.host_adjoint import _solve as solve_on_host
-from hks_jax.eigen.shift_invert.matrices import host_matrices
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
+from hks_jax.linear.host_matrices import host_matrices
 
 
 def definite_beyond_the_first(n, columns):

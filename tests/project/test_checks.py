@@ -64,7 +64,6 @@ def test_counts_of_solvers(solver, name, value):
 
 
 OTHERS = {
-    "tolerance of hks": ("tolerance", lambda v: hj.hks(pairs(), [1.0], method="spectrum-free", tolerance=v)),
     "tolerance of hks_auto": ("tolerance", lambda v: hj.hks_auto(pairs(), [1.0], tolerance=v)),
     "tolerance of hks_spectrum_free": (
         "tolerance",
@@ -171,8 +170,7 @@ def test_other_objects_than_arrays_fields_and_eigenpairs_are_named_with_a_remedy
             "vertices: got .*; expected .*. Pass its .vertices",
         ),
         (lambda: hj.eigh(matrix), r"A: got .*; expected an array of numbers. Pass its .todense\(\)"),
-        (lambda: hj.eigenpairs(FIELD.tensors), r"K: got shape .* For tensors, pass TensorField\(grid, tensors\)"),
-        (lambda: hj.eigenpairs(FIELD, interval=3.0), r"interval: got shape \(\); expected the ends \(a, b\)"),
+        (lambda: hj.eigenpairs(FIELD.tensors, 3), r"K: got shape .* For tensors, pass TensorField\(grid, tensors\)"),
         (lambda: hj.eigenpairs(FIELD, 3, solver=["dense"]), r"solver: got \['dense'\]; expected \"auto\""),
         (lambda: hj.assemble(FIELD, fields=path), "fields: got 'tensors.nii'; expected a dictionary"),
         (lambda: hj.matrix_function(np.eye(2), np.exp), "f: got .*; expected a function of a JAX scalar"),

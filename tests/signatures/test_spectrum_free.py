@@ -338,16 +338,14 @@ def test_auto_takes_each_time_from_the_method_that_reaches_it(monkeypatch):
     assert float(found.overlap_difference) < 1e-4
     assert "1 of 3 times use selected-inversion: 0.02" in found.summary()
     assert "at t = 0.5 the signatures with and without eigenpairs differ" in found.summary()
-    np.testing.assert_array_equal(hj.hks(pairs, times, method="auto"), found.values)
-    np.testing.assert_allclose(
-        hj.hks(pairs, times[:1], "flat", method="spectrum-free")[0], expected[0] * 4 * np.pi * times[0], rtol=1e-3
-    )
+    flat = hj.hks_auto(pairs, times[:1], "flat").values
+    np.testing.assert_allclose(flat[0], expected[0] * 4 * np.pi * times[0], rtol=1e-3)
     assert hj.hks_auto(pairs, times[1:]).method == "none"
     with pytest.raises(ValueError, match="traced"):
-        jax.jit(lambda t: hj.hks(pairs, t, method="auto"))(jnp.array(times))
+        jax.jit(lambda t: hj.hks_auto(pairs, t).values)(jnp.array(times))
     with pytest.raises(ValueError, match="heat-trace"):
-        hj.hks(pairs, times, "heat-trace", method="spectrum-free")
-    monkeypatch.setattr("hks_jax.signatures.hks._DEARER", 0.0)  # no comparison is cheap enough
+        hj.hks_auto(pairs, times, "heat-trace")
+    monkeypatch.setattr("hks_jax.signatures.hks_auto._DEARER", 0.0)  # no comparison is cheap enough
     found = hj.hks_auto(pairs, times)
     assert np.isnan(found.overlap_time)
     assert "differ" not in found.summary()
@@ -397,5 +395,3 @@ def test_errors_say_what_to_do():
             call(mesh, [0.1])
     with unchecked(), pytest.raises(TypeError, match="domain: got int"):
         hj.hks_spectrum_free(3, [0.1])
-    with unchecked(), pytest.raises(ValueError, match="method: got 'none'"):
-        hj.hks(hj.eigenpairs(flat((5, 6), (1.0, 1.0)), 20), [0.1], method="none")

@@ -154,30 +154,24 @@ def group_numbers(
 
 
 def shifts_between(values: Values, nearest: Shifts, farthest: Shifts) -> Shifts:
-    """Return each group's shift, whose distance from `first_beyond` is about √(``nearest`` · ``farthest``)."""
+    """Return each group's shift: the midpoint of the computed gap whose distance from `first_beyond` is nearest to
+    √(``nearest`` · ``farthest``), or a negative number if all eigenvalues are equal."""
     xp = values.__array_namespace__()
     targets, below = first_beyond(values) - xp.sqrt(nearest * farthest), -0.1 * values[-1]
     if values.size == 1:
         return xp.broadcast_to(below, targets.shape)
-    return middles_of_gaps(values, targets, below)
-
-
-def middles_of_gaps(values: Values, targets: Shifts, otherwise: Scalar) -> Shifts:
-    """Return the midpoint of the computed gap nearest to each target; ``otherwise`` if all eigenvalues are equal."""
-    xp = values.__array_namespace__()
-    gaps = xp.diff(values)
-    typical = (values[-1] - values[0]) / (values.size - 1)
+    gaps, typical = xp.diff(values), (values[-1] - values[0]) / (values.size - 1)
     distance = xp.abs((values[:-1] + gaps / 2)[None] - targets[:, None])
     chosen = xp.argmin(xp.where(gaps >= 0.1 * typical, distance, xp.inf), axis=1)
-    return xp.where(typical > 0, values[chosen] + gaps[chosen] / 2, otherwise)
+    return xp.where(typical > 0, values[chosen] + gaps[chosen] / 2, below)
 
 
 def unsolved(failed: int | str, total: int) -> str:
     """Return the message that the linear solves for some eigenpairs did not converge."""
     return (
         f"derivative: the linear solves for {failed} of {total} eigenpairs did not converge, so their derivatives are "
-        "NaN. Either k or an end of the interval cuts a cluster of eigenvalues, or the eigenpairs did not converge. "
-        "Use another k, interval or solver, or set multiplet='drop' in `eigenpairs`"
+        "NaN. Either k cuts a cluster of eigenvalues, or the eigenpairs did not converge. Use another k or solver, or "
+        "set multiplet='drop' in `eigenpairs`"
     )
 
 
@@ -193,37 +187,20 @@ def projected(
     pencil: SymmetricPencil, vectors: Vectors, rhs: Rows, tolerance: float, amplified: OfRows
 ) -> tuple[Rows, OfRows]:
     """Return the projections Q rhsᵢ, where Q = I − MΦΦᵀ, and the wanted relative error of each solution."""
-    lumped = pencil.mass.diagonal()
+    lumped, size = pencil.mass.diagonal(), even_size(len(rhs), _ROWS)
+    starts, _ = row_blocks(len(rhs), size)
 
-    def project(b: Rows, _: Array) -> tuple[Rows, OfRows]:
+    # The last two blocks may overlap; to project their common rows twice changes nothing.
+    def project(number: Array, rows: tuple[Rows, OfRows]) -> tuple[Rows, OfRows]:
+        start = jnp.asarray(starts)[number]
+        b = jax.lax.dynamic_slice_in_dim(rows[0], start, size)
         left = b - pencil.mass.apply(matmul(inner_products(vectors, b), vectors))
-        return left, norms(left, lumped)
+        after = jax.lax.dynamic_update_slice_in_dim(rows[1], norms(left, lumped), start, axis=0)
+        return jax.lax.dynamic_update_slice_in_dim(rows[0], left, start, axis=0), after
 
     before = norms(rhs, lumped)
-    left, after = _in_parts(project, rhs, before)
+    left, after = jax.lax.fori_loop(0, len(starts), project, (rhs, before))
     return left, wanted_errors(before, after, amplified, tolerance, rhs.dtype)
-
-
-def cleaned(pencil: SymmetricPencil, vectors: Vectors, x: Rows) -> Rows:
-    """Return the projection x − ΦΦᵀMx of rows."""
-
-    def clean(x: Rows) -> tuple[Rows]:
-        return (x - matmul(inner_products(vectors, pencil.mass.apply(x)), vectors),)
-
-    return _in_parts(clean, x)[0]
-
-
-def _in_parts(project: Callable[..., tuple[Array, ...]], *rows: Array) -> tuple[Array, ...]:
-    size = even_size(len(rows[0]), _ROWS)
-    starts, _ = row_blocks(len(rows[0]), size)
-
-    def step(number: Array, rows: tuple[Array, ...]) -> tuple[Array, ...]:
-        start = jnp.asarray(starts)[number]
-        parts = project(*(jax.lax.dynamic_slice_in_dim(each, start, size) for each in rows))
-        whole = zip(rows, parts, strict=True)
-        return tuple(jax.lax.dynamic_update_slice_in_dim(each, part, start, axis=0) for each, part in whole)
-
-    return jax.lax.fori_loop(0, len(starts), step, rows)
 
 
 def solve_in_blocks(

@@ -22,7 +22,7 @@ from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, Status, silent
 from hks_jax.fem.halo import checked_mesh
 from hks_jax.fem.nodal import NodalPencil, nodal_pencil
-from hks_jax.fem.pencil import Pencil
+from hks_jax.fem.pencil import Pencil, from_lower_bound
 from hks_jax.fem.space import GridSpace
 from hks_jax.fem.stencil import StencilOperator
 from hks_jax.linear.loops import while_loop
@@ -66,7 +66,6 @@ class ChebyshevFilter(Eigensolver[Pencil]):
     """
 
     name: ClassVar[str] = "chebyshev-filter"
-    indefinite: ClassVar[bool] = False
     tolerance: float = eqx.field(default=1e-8, static=True)
     block: int = eqx.field(default=32, static=True)
     max_rounds: int = eqx.field(default=60, static=True)
@@ -83,11 +82,19 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         """Return the k lowest eigenpairs; the bound is NaN, because the method has no certificate."""
         if not isinstance(pencil.stiffness, StencilOperator):
             raise ValueError("solver: got 'chebyshev-filter', which needs a grid; use 'shift-invert' for a mesh")
-        assert isinstance(pencil.space, GridSpace)
-        plan = self.plan(k, pencil.space)
-        compute = _compiled if is_traced(pencil) else _lowest
-        values, vectors = compute(pencil, plan, self.max_rounds, report)
-        return values, vectors, jnp.asarray(jnp.nan, values.dtype)
+        if not pencil.bounded:
+            raise ValueError(
+                "solver: got 'chebyshev-filter', which needs a positive semidefinite stiffness with a known null "
+                'space; the null space is unknown. Use "block-lanczos" or "dense", or give `sparse_pencil` the null '
+                "vectors"
+            )
+        moved, origin = from_lower_bound(pencil)
+        assert isinstance(moved, Pencil)
+        assert isinstance(moved.space, GridSpace)
+        plan = self.plan(k, moved.space)
+        compute = _compiled if is_traced(moved) else _lowest
+        values, vectors = compute(moved, plan, self.max_rounds, report)
+        return values + origin, vectors, jnp.asarray(jnp.nan, values.dtype)
 
     def guards(self, k: int, n_dof: int) -> int:
         """Return the number of guard pairs that keep linear solves well conditioned: half of the additional vectors."""

@@ -5,18 +5,16 @@ from functools import partial
 from typing import ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hks_jax.checks import require_count
 from hks_jax.compilation import jit_quickly
-from hks_jax.eigen.adjoints.adjoint import Values, Vectors
-from hks_jax.eigen.inertia import LocatedPencil, Number, dissected, lowered, translated
+from hks_jax.eigen.inertia import Scalar, dissected, locate
 from hks_jax.eigen.lanczos.slicing import cut, search
 from hks_jax.eigen.lanczos.slicing_state import Plan, Problem, SlicingState, Stored, first_state, unfinished
-from hks_jax.eigen.quality import measure_pairs
-from hks_jax.eigen.solver import Dense, Eigensolver, RawPairs, Report, silent
+from hks_jax.eigen.quality import indistinct, measure_pairs
+from hks_jax.eigen.solver import FAR, Dense, Eigensolver, RawPairs, Report, silent
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.loops import when, while_loop
@@ -27,6 +25,8 @@ SLICE = 170
 """The number of eigenvalues per slice. More slices take more factorisations, but less orthogonalisation."""
 _DENSE = 3000
 """The largest number of unknowns for which the dense solver takes over if slicing fails."""
+_COPIES = 1000
+"""The largest number of lowest eigenvalues that are all computed because rounding does not separate them."""
 
 
 class BlockLanczos(Eigensolver[SymmetricPencil]):
@@ -59,11 +59,34 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
             require_count("slice_size", self.slice_size)
 
     def lowest(self, pencil: SymmetricPencil, k: int, report: Report = silent) -> RawPairs:
-        """Return the k lowest eigenpairs; for a `LocatedPencil`, the first k above its origin."""
-        plan = self.plan(k, min(pencil.n_null, k))
-        problem, dissection = expected(pencil, plan), dissected(pencil)
+        """Return the k lowest eigenpairs, and the bound below which inertia certifies that none is missing."""
+        # Weyl's law predicts the beginning and density of some spectra; for the others, inertia is needed.
+        if isinstance(pencil, Pencil) and pencil.measured and pencil.null_space is not None:
+            plan = self.plan(k, min(pencil.n_null, k))
+            return self._by_slices(expected(pencil, plan), plan, report)
+        half = max(self.plan(k).slice_size // 2, 1)
+        origin, first, below = locate(pencil, half, self.block)
+        reach, number = first - origin, k
+        if not is_traced(below) and 2 * half < below <= _COPIES:
+            # The lowest eigenvalue has an unexpectedly high multiplicity. Compute all pairs that `locate` counted.
+            number = max(k, int(below))
+            if number > self.max_pairs(pencil.size):
+                return Dense().lowest(pencil, k)
+        plan, moved = self.plan(number), _moved(pencil, origin, reach, reach / jnp.maximum(below, 1))
+        values, vectors, bound = self._by_slices(moved, plan, report)
+        spread = values[-1] - values[0]
+        if not is_traced(values) and spread > indistinct(pencil, values.dtype) and values[0] > FAR * spread:
+            # Solve again from an origin nearer to the spectrum, because distances of eigenvalues from a remote origin
+            # have fewer correct digits. If all eigenvalues are equal, the lost digits do not matter.
+            origin = origin + values[0] - spread
+            moved = _moved(pencil, origin, 2 * spread, spread / number)
+            values, vectors, bound = self._by_slices(moved, plan, report)
+        return values[:k] + origin, vectors[:k], bound + origin
+
+    def _by_slices(self, problem: Problem, plan: Plan, report: Report) -> RawPairs:
+        k, dissection = plan.wanted, dissected(problem.pencil)
         if not is_traced(problem):
-            problem = problem._replace(pencil=tabulated(pencil))
+            problem = problem._replace(pencil=tabulated(problem.pencil))
 
         def step(both: tuple[SlicingState, Stored]) -> tuple[SlicingState, Stored]:
             factor, searchable, both = cut(problem, dissection, plan, *both)
@@ -74,14 +97,11 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
             return both
 
         state, stored = while_loop(lambda both: unfinished(plan, both[0]), step, first_state(problem, plan))
-        values, vectors, bound = _lowest(pencil, state.values, stored, state.complete_below, k)
-        if is_traced(bound) or (state.finished and not math.isnan(bound)) or pencil.size > _DENSE:
+        values, vectors, bound = _lowest(problem.pencil, state.values, stored, state.complete_below, k)
+        if is_traced(bound) or (state.finished and not math.isnan(bound)) or problem.pencil.size > _DENSE:
             return values, vectors, bound
         report("slicing missed pairs: computing all pairs with the dense solver")
-        first = int(pencil.negative) if isinstance(pencil, LocatedPencil) else 0
-        values, vectors, bound = Dense().lowest(pencil, first + k)
-        at = first + jnp.arange(k)  # indices beyond the end give NaN
-        return values.at[at].get(mode="fill"), vectors.at[at].get(mode="fill"), bound
+        return Dense().lowest(problem.pencil, k)
 
     def max_pairs(self, n_dof: int) -> int:
         """Return the largest k that leaves room for a Lanczos basis."""
@@ -95,24 +115,23 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
         return Plan(k, self.block, size, 3 * slices + 12, self.tolerance / 4, nulls)
 
 
-def known_by_weyl(pencil: SymmetricPencil) -> bool:
-    """Return whether Weyl's law predicts the beginning and density of the spectrum; otherwise inertia is needed."""
-    return isinstance(pencil, Pencil) and pencil.measured and pencil.null_space is not None
-
-
 @jit_quickly(static_argnames="plan")
-def expected(pencil: SymmetricPencil, plan: Plan) -> Problem:
-    """Return the pencil with estimates of its spectrum, from the counts of a `LocatedPencil` or from Weyl's law."""
-    if isinstance(pencil, LocatedPencil):
-        spacing = pencil.spacing
-        return Problem(pencil, pencil.first, spacing, spacing, spacing, pencil.negative)
-    assert isinstance(pencil, Pencil)
+def expected(pencil: Pencil, plan: Plan) -> Problem:
+    """Return the pencil with estimates of its spectrum from Weyl's law."""
     assert pencil.volume is not None
     n, dtype = pencil.space.dimension, pencil.stiffness.dtype
     first, several, lowest = (
         weyl(j, pencil.volume, n).astype(dtype) for j in (min(plan.wanted, plan.slice_size) / 2 + 1, plan.slice_size, 1)
     )
-    return Problem(pencil, first, several / plan.slice_size, lowest, jnp.zeros((), dtype), jnp.zeros((), int))
+    return Problem(pencil, first, several / plan.slice_size, lowest, jnp.zeros((), dtype))
+
+
+@jit_quickly()
+def _moved(pencil: SymmetricPencil, origin: Scalar, first: Scalar, spacing: Scalar) -> Problem:
+    """Return the pencil of K − σ₀M and M for an origin σ₀ below the spectrum, with the beginning of its spectrum."""
+    moved, source = pencil.moved_by(origin)
+    spacing = spacing.astype(origin.dtype)
+    return Problem(SymmetricPencil(moved, pencil.mass, source=source), first, spacing, spacing, spacing)
 
 
 @jit_quickly(static_argnames="k")
@@ -126,29 +145,3 @@ def _lowest(
     if values.dtype == jnp.float32:
         bound = jnp.where(jnp.any(measure_pairs(pencil, vectors, values)[2] & known), jnp.nan, bound)
     return jnp.where(known, values, jnp.nan), jnp.where(known[:, None], vectors, jnp.nan), bound
-
-
-def first_from_origin(solver: Eigensolver, k: int, guards: int, report: Report, pencil: LocatedPencil) -> RawPairs:
-    """Return the first k pairs above the origin, then guard pairs: the next pairs above, and pairs below the origin.
-
-    If the spectrum has too few guards, the remaining guards are zero vectors with the eigenvalue of the first pair.
-    """
-    if isinstance(solver, Dense):
-        values, vectors, bound = solver.lowest(pencil, pencil.size)
-        values, vectors = _from(pencil.negative, pencil.size, values, vectors)
-        return values[: k + guards], vectors[: k + guards], bound
-    if guards == 0:
-        return solver.lowest(pencil, k, report)
-    assert isinstance(solver, BlockLanczos)
-    distance, before = lowered(pencil, guards // 2, solver.block)
-    moved = translated(pencil, -distance, pencil.negative - before, pencil.first + distance, pencil.spacing)
-    values, vectors, bound = solver.lowest(moved, k + guards, report)
-    return *_from(before, pencil.size - moved.negative, values - distance, vectors), bound - distance
-
-
-@jax.jit
-def _from(first: Number, existing: Number | int, values: Values, vectors: Vectors) -> tuple[Values, Vectors]:
-    """Rotate the order of the pairs until pair ``first`` comes first; pairs that do not exist become zero vectors."""
-    there = jnp.arange(values.size) < existing
-    values, vectors = jnp.where(there, values, values[first]), jnp.where(there[:, None], vectors, 0)
-    return jnp.roll(values, -first), jnp.roll(vectors, -first, axis=0)

@@ -53,16 +53,16 @@ def cut(
 
 @jit_quickly(static_argnames="plan")
 def _consider(
-    problem: Problem, negative: Int[Array, ""], trial: Trial, plan: Plan, state: SlicingState
+    problem: Problem, below: Int[Array, ""], trial: Trial, plan: Plan, state: SlicingState
 ) -> tuple[Bool[Array, ""], Bool[Array, ""], SlicingState]:
     """Decide whether to search at the current shift, and whether to free storage first; also return the new state."""
-    known, below = jnp.sum(state.values < state.shift), negative - problem.negative
+    known = jnp.sum(state.values < state.shift)
     missing = below - known
     complete = trial.sound & (missing == 0)
     last = jnp.sort(state.values)[plan.wanted - 1]
     # The search ends if all wanted pairs are known, or all but copies of the last one, or if no further pairs exist.
     all_wanted = (known >= plan.wanted) | (last * (1 - 2 * _COPY) < state.shift)
-    finished = complete & (all_wanted | (negative == problem.pencil.size))
+    finished = complete & (all_wanted | (below == problem.pencil.size))
     # If lowering the shift leaves equally many eigenvalues missing, the missing ones are copies of a multiple
     # eigenvalue. The search for these copies is at the lowered shift, repeatedly if necessary.
     too_many = trial.sound & (missing > plan.slice_size) & (below != state.below)
@@ -143,8 +143,8 @@ def _nearest(
         if turn > 2 and not worst < before / 2:
             break
     ritz = jnp.pad(1 / (values - state.shift), (0, plan.ritz - count)), jnp.pad(x.T, ((0, plan.ritz - count), (0, 0)))
-    interval = jnp.where(problem.negative > 0, 0, -jnp.inf).astype(values.dtype), jnp.asarray(jnp.inf, values.dtype)
-    order, following = _accept(problem, plan, ritz, interval, state)
+    everywhere = jnp.asarray(-jnp.inf, values.dtype), jnp.asarray(jnp.inf, values.dtype)
+    order, following = _accept(problem, plan, ritz, everywhere, state)
     return order, ritz[1], following
 
 
@@ -175,8 +175,7 @@ def _window(
     nearest = jnp.argsort(jnp.abs(state.values - state.shift))[:rows]
     vectors = jnp.where((nearest < state.known)[:, None], vectors[nearest], 0)
     others = jnp.where(jnp.isin(jnp.arange(plan.capacity), nearest), jnp.nan, state.values)
-    bottom = jnp.where(problem.negative > 0, 0, -jnp.inf)
-    low = jnp.fmax(jnp.nanmax(jnp.where(others < state.shift, others * (1 + 1e-6), -jnp.inf), initial=-jnp.inf), bottom)
+    low = jnp.nanmax(jnp.where(others < state.shift, others * (1 + 1e-6), -jnp.inf), initial=-jnp.inf)
     high = jnp.nanmin(jnp.where(others > state.shift, others * (1 - 1e-6), jnp.inf), initial=jnp.inf)
     left = jnp.maximum(plan.wanted - state.known, plan.slice_size // 4)
     # The last slice is smaller, but contains some unwanted eigenvalues, because the certificate needs a gap.
@@ -236,8 +235,7 @@ def _accept(
     lowest = jnp.min(jnp.where(~converged & (values > low) & (values < shift), values, shift))
     seen, stuck = lowest < shift, ~complete & (count == 0)
     again = jnp.where(seen, lowest + (shift - lowest) / 4, (state.complete_below + shift) / 2)
-    bottom = (state.reached <= 0) & (problem.negative == 0)
-    again = jnp.where(stuck & bottom, -jnp.abs(shift) / jnp.maximum(state.below, 1).astype(dtype), again)
+    again = jnp.where(stuck & (state.reached <= 0), -jnp.abs(shift) / jnp.maximum(state.below, 1).astype(dtype), again)
     leftover = jnp.argsort(jnp.where(above & ~accepted, near, jnp.inf))[: plan.block]
     # If no pair converged, and none is missing below the shift, a wide gap follows; move to the next Ritz values.
     beyond = jnp.sort(jnp.where(above, near, jnp.inf))[min(plan.slice_size // 4, plan.ritz - 1)]

@@ -17,14 +17,13 @@ Stored = Float[Array, "capacity n_dof"]
 
 
 class Problem(NamedTuple):
-    """A pencil, and estimates of its spectrum. The wanted eigenvalues are the lowest that are not negative."""
+    """A pencil, and estimates of its spectrum. No eigenvalue is negative."""
 
     pencil: SymmetricPencil  # K and M
     first: Float[Array, ""]  # the first shift
     spacing: Float[Array, ""]  # the expected mean gap of eigenvalues
     lowest: Float[Array, ""]  # the expected lowest nonzero eigenvalue
     unit: Float[Array, ""]  # the least number by which residuals are divided in relative residuals
-    negative: Int[Array, ""]  # the number of negative eigenvalues, which are not wanted
 
 
 class Plan(NamedTuple):
@@ -72,7 +71,7 @@ class SlicingState(NamedTuple):
     values: Float[Array, " capacity"]  # known eigenvalues in the order of acceptance, padded with infinity
     known: Int[Array, ""]  # the number of known pairs
     shift: Float[Array, ""]  # the next shift
-    # the number of eigenvalues between zero and the shift, by inertia; −1 if the factorisation was too inaccurate
+    # the number of eigenvalues below the shift, by inertia; −1 if the factorisation was too inaccurate
     below: Int[Array, ""]
     multiple: Bool[Array, ""]  # whether many copies of one multiple eigenvalue are probably missing
     far: Float[Array, ""]  # the last shift at which too many eigenvalues were missing for a search

@@ -17,9 +17,9 @@ from threadpoolctl import threadpool_limits
 
 from hks_jax.eigen.adjoints import adjoint as complement
 from hks_jax.eigen.adjoints.adjoint import Adjoint, Rows, Values, Vectors
-from hks_jax.eigen.shift_invert.matrices import factorise_stably_on_host, host_matrices
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
+from hks_jax.linear.host_matrices import factorise_stably_on_host, host_matrices
 from hks_jax.traced import is_traced
 
 _BLOCK = 16
