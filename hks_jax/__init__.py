@@ -58,7 +58,7 @@ from hks_jax.linear.dense_eigh import DenseEigenpairs as DenseEigenpairs
 from hks_jax.linear.dense_eigh import eigh as eigh
 from hks_jax.linear.factorised_matrix import FactorisedMatrix as FactorisedMatrix
 from hks_jax.linear.matrix_function import matrix_function as matrix_function
-from hks_jax.linear.pencil import SymmetricPencil as SymmetricPencil
+from hks_jax.linear.symmetric_pencil import SymmetricPencil as SymmetricPencil
 from hks_jax.signatures.alignment import Alignment as Alignment
 from hks_jax.signatures.alignment import align as align
 from hks_jax.signatures.distances import biharmonic_distance as biharmonic_distance

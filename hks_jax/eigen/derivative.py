@@ -21,8 +21,8 @@ from hks_jax.fem.pencil import Pencil
 from hks_jax.linear import lapack
 from hks_jax.linear.linear_map import first_order_only, with_transpose
 from hks_jax.linear.loops import one_by_one
-from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import inner_products, matmul
+from hks_jax.linear.symmetric_pencil import SymmetricPencil
 from hks_jax.traced import is_traced
 
 OnFailure = Literal["nothing", "warning", "error"]

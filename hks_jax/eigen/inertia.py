@@ -21,7 +21,7 @@ from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.factorised_matrix import certain_factorisation
 from hks_jax.linear.loops import while_loop
 from hks_jax.linear.multifrontal import factorise, try_out
-from hks_jax.linear.pencil import SymmetricPencil
+from hks_jax.linear.symmetric_pencil import SymmetricPencil
 from hks_jax.traced import is_traced
 
 _BESIDE = (1e-6, 1e-5, 1e-4, 1e-3)

@@ -25,7 +25,7 @@ from hks_jax.fem.space import MatrixSpace
 from hks_jax.linear.host_matrices import inertia_on_host
 from hks_jax.linear.operators import ROUNDING, DiagonalOperator, Operator, SparseOperator, require_symmetric
 from hks_jax.linear.pattern import SparsePattern
-from hks_jax.linear.pencil import NullSpace, SymmetricPencil
+from hks_jax.linear.symmetric_pencil import NullSpace, SymmetricPencil
 from hks_jax.traced import is_traced
 
 _FEW = 8

@@ -17,9 +17,9 @@ from hks_jax.checks import real_array
 from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.multifrontal import Factorisation, Trial, eliminate, factorise, try_out
 from hks_jax.linear.operators import DiagonalOperator, OfColumns, PatternedOperator
-from hks_jax.linear.pencil import SymmetricPencil, tabulated
 from hks_jax.linear.selected_inversion import Eliminated, inverse_entries, selected
 from hks_jax.linear.symmetric_inverse import symmetric_inverses
+from hks_jax.linear.symmetric_pencil import SymmetricPencil, tabulated
 from hks_jax.traced import is_traced
 
 _PROBES = 4

@@ -21,8 +21,8 @@ from hks_jax.eigen.adjoints.complement import Adjoint, Columns, OfRows, Rows, Sh
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
 from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.multifrontal import Factorisation, factorise
-from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import matmul, products_with_columns
+from hks_jax.linear.symmetric_pencil import SymmetricPencil
 
 BLOCK = 16
 """The number of right-hand sides that conjugate gradients treat at once."""

@@ -22,8 +22,8 @@ from hks_jax.linear import lapack
 from hks_jax.linear.dissection import Dissection
 from hks_jax.linear.loops import by_column_ranges, when
 from hks_jax.linear.multifrontal import Factorisation, Trial, factorise, try_out
-from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import gram, matmul, products_with_columns
+from hks_jax.linear.symmetric_pencil import SymmetricPencil
 from hks_jax.traced import is_traced
 
 _ERROR = 0.1
@@ -55,7 +55,7 @@ class Problem(NamedTuple):
     unit: Float[Array, ""]  # the least number by which residuals are divided in relative residuals
 
 
-class Plan(NamedTuple):
+class SlicingPlan(NamedTuple):
     """The static settings of spectrum slicing."""
 
     wanted: int  # the number of eigenpairs
@@ -141,7 +141,7 @@ class SlicingState(NamedTuple):
 
 
 @jit_quickly(static_argnames="plan")
-def first_state(problem: Problem, plan: Plan) -> tuple[SlicingState, Stored]:
+def first_state(problem: Problem, plan: SlicingPlan) -> tuple[SlicingState, Stored]:
     """Return the initial state, without known pairs, and storage for eigenvectors."""
     n, dtype = problem.pencil.size, problem.pencil.stiffness.dtype
     noise = jax.random.normal(jax.random.key(0), (n, plan.block), dtype)
@@ -167,18 +167,18 @@ def first_state(problem: Problem, plan: Plan) -> tuple[SlicingState, Stored]:
 
 
 @jit_quickly(static_argnames="plan")
-def unfinished(plan: Plan, state: SlicingState) -> Bool[Array, ""]:
+def unfinished(plan: SlicingPlan, state: SlicingState) -> Bool[Array, ""]:
     """Return whether another slice is needed and allowed."""
     return ~state.finished & (state.slices < plan.max_slices)
 
 
-def crowded(plan: Plan, state: SlicingState) -> Bool[Array, ""]:
+def crowded(plan: SlicingPlan, state: SlicingState) -> Bool[Array, ""]:
     """Return whether to discard some known pairs, because the storage is full or the search is stuck."""
     return state.stuck | (state.known > plan.capacity - plan.ritz)
 
 
 @jit_quickly(static_argnames="plan", donate_argnames="vectors")
-def make_room(plan: Plan, state: SlicingState, vectors: Stored) -> tuple[SlicingState, Stored]:
+def make_room(plan: SlicingPlan, state: SlicingState, vectors: Stored) -> tuple[SlicingState, Stored]:
     """Discard the highest known pairs to make room for a search; if stuck, discard all pairs above ``reached``."""
     order = jnp.argsort(state.values)
     count = jnp.where(state.stuck, jnp.sum(state.values <= state.reached), state.known)
@@ -190,7 +190,7 @@ def make_room(plan: Plan, state: SlicingState, vectors: Stored) -> tuple[Slicing
 
 
 def cut(
-    problem: Problem, dissection: Dissection, plan: Plan, state: SlicingState, vectors: Stored
+    problem: Problem, dissection: Dissection, plan: SlicingPlan, state: SlicingState, vectors: Stored
 ) -> tuple[Factorisation, Bool[Array, ""], tuple[SlicingState, Stored]]:
     """Factorise K − σM at the next shift σ; also return whether to search around σ, and the state with free storage."""
     factor = factorise(dissection, problem.pencil.shifted(state.shift))
@@ -201,7 +201,7 @@ def cut(
 
 @jit_quickly(static_argnames="plan")
 def _consider(
-    problem: Problem, below: Int[Array, ""], trial: Trial, plan: Plan, state: SlicingState
+    problem: Problem, below: Int[Array, ""], trial: Trial, plan: SlicingPlan, state: SlicingState
 ) -> tuple[Bool[Array, ""], Bool[Array, ""], SlicingState]:
     """Decide whether to search at the current shift, and whether to free storage first; also return the new state."""
     known = jnp.sum(state.values < state.shift)
@@ -247,14 +247,14 @@ def _consider(
     return searchable, searchable & crowded(plan, state), state
 
 
-def _needed(problem: Problem, plan: Plan, lowest: Scalar, excuse: Scalar | float = 1.0) -> Scalar:
+def _needed(problem: Problem, plan: SlicingPlan, lowest: Scalar, excuse: Scalar | float = 1.0) -> Scalar:
     """Return the largest residual ‖Kφ − λMφ‖/‖Mφ‖ at which the lowest missing eigenvalue counts as converged."""
     rounding = excuse * indistinct(problem.pencil, lowest.dtype)
     return allowed_residuals(jnp.maximum(lowest, problem.unit), rounding, plan.tolerance)
 
 
 def search(
-    problem: Problem, factor: Factorisation, plan: Plan, both: tuple[SlicingState, Stored]
+    problem: Problem, factor: Factorisation, plan: SlicingPlan, both: tuple[SlicingState, Stored]
 ) -> tuple[SlicingState, Stored]:
     """Find the eigenpairs around the shift."""
     state, vectors = both
@@ -278,7 +278,7 @@ def search(
 # more steps than there are distinct eigenvalues. Inverse iteration with m vectors finds m pairs near the shift. If the
 # multiplicity of an eigenvalue exceeds m, any m vectors of its eigenspace suffice.
 def _nearest(
-    problem: Problem, shifted: ShiftedSolve, plan: Plan, state: SlicingState, vectors: Stored
+    problem: Problem, shifted: ShiftedSolve, plan: SlicingPlan, state: SlicingState, vectors: Stored
 ) -> tuple[Order, Float[Array, "ritz n_dof"], SlicingState]:
     """Search by inverse iteration, orthogonal to all known eigenvectors; see `_accept`. Values must be concrete."""
     missing = int(state.below - jnp.sum(state.values < state.shift))
@@ -313,7 +313,7 @@ def _inverse_iteration(
 
 @jit_quickly(static_argnames=("plan", "rows"))
 def _window(
-    problem: Problem, plan: Plan, state: SlicingState, vectors: Stored, rows: int
+    problem: Problem, plan: SlicingPlan, state: SlicingState, vectors: Stored, rows: int
 ) -> tuple[Float[Array, "rows n_dof"], Interval, Int[Array, ""]]:
     """Return the known eigenvectors, the interval and the number of Lanczos blocks for a search around the shift.
 
@@ -338,7 +338,7 @@ def _stored(known_vectors: Stored, vectors: Float[Array, "ritz n_dof"], order: O
 
 @jit_quickly(static_argnames="plan")
 def _accept(
-    problem: Problem, plan: Plan, ritz: RitzPairs, interval: Interval, state: SlicingState
+    problem: Problem, plan: SlicingPlan, ritz: RitzPairs, interval: Interval, state: SlicingState
 ) -> tuple[Order, SlicingState]:
     """Accept the converged Ritz pairs in the interval, and choose the next shift.
 
@@ -407,7 +407,7 @@ def _accept(
     return order, state._replace(shift=jnp.where(complete, following, again))
 
 
-def _spacing(problem: Problem, plan: Plan, state: SlicingState) -> Scalar:
+def _spacing(problem: Problem, plan: SlicingPlan, state: SlicingState) -> Scalar:
     """Return the mean gap of the last known eigenvalues; if few are known, at least the ``spacing`` of the problem."""
     few = jnp.minimum(state.known, plan.slice_size)
     ordered = jnp.sort(state.values)
@@ -416,7 +416,7 @@ def _spacing(problem: Problem, plan: Plan, state: SlicingState) -> Scalar:
     return jnp.where(few < plan.block, jnp.fmax(mean, problem.spacing), mean)
 
 
-def _next_shift(problem: Problem, plan: Plan, state: SlicingState) -> Scalar:
+def _next_shift(problem: Problem, plan: SlicingPlan, state: SlicingState) -> Scalar:
     """Return the next shift: within the next slice, or in a gap above the last wanted eigenvalue."""
     ordered, known = jnp.sort(state.values), state.known
     index = jnp.arange(plan.capacity)
