@@ -32,7 +32,7 @@ from hks_jax.domain.grid import Grid as Grid
 from hks_jax.domain.simplicial_mesh import SurfaceMesh as SurfaceMesh
 from hks_jax.domain.simplicial_mesh import TetMesh as TetMesh
 from hks_jax.domain.tensor_field import TensorField as TensorField
-from hks_jax.eigen.adjoints.adjoint import Adjoint as Adjoint
+from hks_jax.eigen.adjoints.complement import Adjoint as Adjoint
 from hks_jax.eigen.adjoints.factorised_adjoint import FactorisedAdjoint as FactorisedAdjoint
 from hks_jax.eigen.driver import eigenpairs as eigenpairs
 from hks_jax.eigen.driver import eigsh as eigsh
@@ -58,7 +58,7 @@ from hks_jax.linear.dense_eigh import DenseEigenpairs as DenseEigenpairs
 from hks_jax.linear.dense_eigh import eigh as eigh
 from hks_jax.linear.factorised_matrix import FactorisedMatrix as FactorisedMatrix
 from hks_jax.linear.matrix_function import matrix_function as matrix_function
-from hks_jax.linear.pencil import SymmetricPencil as SymmetricPencil
+from hks_jax.linear.symmetric_pencil import SymmetricPencil as SymmetricPencil
 from hks_jax.signatures.alignment import Alignment as Alignment
 from hks_jax.signatures.alignment import align as align
 from hks_jax.signatures.distances import biharmonic_distance as biharmonic_distance

@@ -12,6 +12,8 @@ from jaxtyping import Array, Bool, Float
 
 from hks_jax.traced import is_staged
 
+Scalar = Float[Array, ""]
+
 P = ParamSpec("P")
 R = TypeVar("R")
 

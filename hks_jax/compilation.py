@@ -4,6 +4,7 @@ import inspect
 import os
 from collections.abc import Callable, Sequence
 from functools import cache, partial, wraps
+from types import SimpleNamespace
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import equinox as eqx
@@ -21,13 +22,14 @@ T = TypeVar("T")
 _OPTIONS: dict[str, bool | int | str] = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 2}
 """Compiler options that halve the time of compilation. In measurements, the options did not slow compiled code."""
 
-NumPyRule = Callable[[list[Any], list[Any] | None, list[Any] | None], Any]
+NumPyRule = Callable[[SimpleNamespace, SimpleNamespace | None, list[Any] | None], Any]
 """A rule (primals, x, y) that computes a function or its derivative by NumPy, or returns None if it cannot.
 
-The primals are all arguments of the function, x are tangents of some arguments, and y are cotangents of the leaves of
-the function's result. If x and y are None, the rule returns the function's result. If only y is None, the rule returns
-the tangent of the result. If y is given, x contains only the shapes of the tangents, and the rule returns the
-cotangents of the arguments that x describes. If the function is linear, the primals contain None for linear arguments.
+The primals are all arguments of the function, by their names, x are tangents of some arguments, and y are cotangents of
+the leaves of the function's result. If x and y are None, the rule returns the function's result. If only y is None, the
+rule returns the tangent of the result. If y is given, x contains only the shapes of the tangents, and the rule returns
+the cotangents of the arguments that x describes, by their names. If the function is linear, the primals contain None
+for linear arguments.
 """
 
 
@@ -67,7 +69,7 @@ def jit_quickly(
                 return usual(*args, **kwargs)
             bound = signature.bind(*args, **kwargs)
             if not linear and not is_traced((args, kwargs)):
-                found = _apply(numpy_rule, bound.args, None, None)
+                found = _apply(numpy_rule, tuple(bound.arguments), bound.args, None, None)
                 return found if found is not None else (quick if _understood() else usual)(*args, **kwargs)
             given = {name: None if name in static else x for name, x in bound.arguments.items()}
             moved = [jax.tree.map(partial(is_moved, name), x) for name, x in given.items()]
@@ -76,7 +78,7 @@ def jit_quickly(
             if whole or is_traced(known) or not all(map(_is_inexact, x)):
                 return usual(*args, **kwargs)
             fixed = tuple(bound.arguments[name] if name in static else None for name in given)
-            program = _Program(usual, fixed, jax.tree.structure(parts), numpy_rule)
+            program = _Program(usual, tuple(given), fixed, jax.tree.structure(parts), numpy_rule)
             if not linear:
                 return _differentiable(program, known, x)
             results, structure = jax.tree.flatten(shapes(*bound.args))
@@ -151,6 +153,7 @@ class _Program(NamedTuple):
     """A function of a flat list of arrays and of static arguments. Equal instances share one compilation."""
 
     function: Callable[..., Any]
+    names: tuple[str, ...]
     fixed: tuple[Any, ...]
     structure: jax.tree_util.PyTreeDef
     numpy_rule: NumPyRule | None
@@ -168,7 +171,7 @@ class _Program(NamedTuple):
 
     def by_numpy(self, *leaves: Any) -> Any:
         """Evaluate the function by NumPy, or return None if there is no rule or values are not concrete on one CPU."""
-        return _apply(self.numpy_rule, self.args(*leaves), None, None)
+        return _apply(self.numpy_rule, self.names, self.args(*leaves), None, None)
 
 
 class _LinearMap(NamedTuple):
@@ -209,7 +212,8 @@ class _LinearMap(NamedTuple):
         known, rest = self.split(leaves)
         x, y = (self.x, [np.asarray(each) for each in rest]) if self.transposed else (rest, None)
         args, change = self.program.split(*known[: len(known) - self.tangent * len(x)], *x)
-        return _apply(self.program.numpy_rule, self.program.args(*known) if self.tangent else args, change, y)
+        own = self.program.args(*known) if self.tangent else args
+        return _apply(self.program.numpy_rule, self.program.names, own, change, y)
 
 
 def _is_inexact(leaf: Any) -> bool:
@@ -221,11 +225,16 @@ def _call(function: Any, *leaves: Any) -> Any:
     return function(*leaves)
 
 
-def _apply(rule: NumPyRule | None, known: Sequence[Any], *others: list[Any] | None) -> Any:
-    if rule is None or not is_concrete_on_cpu((known, others)):
+def _apply(
+    rule: NumPyRule | None, names: tuple[str, ...], known: Sequence[Any], x: list[Any] | None, y: list[Any] | None
+) -> Any:
+    if rule is None or not is_concrete_on_cpu((known, x, y)):
         return None
+    primals = SimpleNamespace(**dict(zip(names, known, strict=True)))
+    tangents = None if x is None else SimpleNamespace(**dict(zip(names, x, strict=True)))
     with np.errstate(all="ignore"):
-        return jax.device_put(rule(list(known), *others))
+        result = rule(primals, tangents, y)
+    return jax.device_put(result if y is None or result is None else [result[name] for name in names if name in result])
 
 
 def _computed(function: _Program | _LinearMap, *leaves: Any) -> Any:

@@ -168,7 +168,7 @@ def main(calls, *programs):
             jax.block_until_ready(function(*args))
 
 
-def run(programs, calls=100, threads=2, devices=1, limit=300):
+def run(programs, calls=40, threads=2, devices=1, limit=300):
     """Run programs in a process of its own, on a pool of so many threads; raise AssertionError if they do not end."""
     environment = {key: value for key, value in os.environ.items() if key != "XLA_FLAGS"} | {
         "PYTHONPATH": f"{HERE.parent}{os.pathsep}{HERE}",

@@ -36,7 +36,7 @@ import hks_jax as hj  # noqa: E402
 from hks_jax.eigen.filter.subspace_iteration import FilterState, GridFilter  # noqa: E402
 from hks_jax.eigen.lanczos import recurrence, slicing  # noqa: E402
 from hks_jax.eigen.lanczos.block_lanczos import expected  # noqa: E402
-from hks_jax.eigen.lanczos.slicing_state import first_state, make_room  # noqa: E402
+from hks_jax.eigen.lanczos.slicing import first_state, make_room  # noqa: E402
 from hks_jax.fem.nodal import nodal_pencil  # noqa: E402
 from hks_jax.fem.pencil import Pencil  # noqa: E402
 from hks_jax.inverse import Data, optimise  # noqa: E402

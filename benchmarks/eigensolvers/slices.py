@@ -24,8 +24,7 @@ from machine import RESULTS, write  # noqa: E402
 
 import hks_jax as hj  # noqa: E402
 from hks_jax.eigen.lanczos.block_lanczos import expected  # noqa: E402
-from hks_jax.eigen.lanczos.slicing import cut, search  # noqa: E402
-from hks_jax.eigen.lanczos.slicing_state import first_state, unfinished  # noqa: E402
+from hks_jax.eigen.lanczos.slicing import cut, first_state, search, unfinished  # noqa: E402
 from hks_jax.fem.pencil import Pencil  # noqa: E402
 from hks_jax.linear.dissection import dissect  # noqa: E402
 

@@ -243,9 +243,12 @@ def _lines(description: dict[str, Any]) -> list[str]:
         lengths = None if mean is None else [math.sqrt(mean * s[key]) for key in keys]
         unit_of_t = description.get("time_units", {}).get(name, "")
         first, own, last = times_in_words([s[key] for key in keys], lengths, unit_of_t, length.strip())
+        rim, size = "about half of the nodes are free of the boundary", "√t is half of the largest extent"
         lines.append(
             f"metric {name:<8} t ≥ {first} for a discretisation error of 1 % (needs {takes}); t ≥ {own} for "
-            f"k = {s['k']}; t ≤ {last}, at which about half of the nodes are free of the boundary"
+            f"k = {s['k']}; t ≤ {last}, at which {rim if s['largest_time'] < s['time_by_size'] else size}"
+            + ". No t satisfies both: the domain has too few nodes"
+            * (s["largest_time"] < s["least_time"])
         )
         if name == "inverse":
             lines.append("operator fick   the same t and k as for the metric inverse")

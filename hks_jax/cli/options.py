@@ -128,8 +128,8 @@ file FILE...
     on the right. Front and head are at the top or on the right, for any storage order of the voxels
 [rim]
 --show-rim
-    draw the nodes near the boundary without hatching. Pictures hatch the nodes at which the boundary contributes over
-    10 % of the signature, where the shape of the domain shows and not curvature
+    draw the nodes near the boundary like all others. Pictures hatch the nodes at which the boundary contributes over
+    10 % of the signature, where the shape of the domain shows and not curvature; curves over t are pale there
 [common]
 --json  print a summary as JSON instead of the names of the files
 -q,--quiet  show no progress

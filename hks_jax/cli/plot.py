@@ -150,11 +150,14 @@ def _curves(result: Result, args: argparse.Namespace) -> Any:
     grid, d, flat = result.grid, result.dimension, result.normalisation == "flat"
     values = result.values / result.flat_scale if flat else result.values  # hks_curves multiplies by this scale
     orientation = placed(result.volume, None, "neurological")
+    near = None if args.show_rim else result.near_rim
     if orientation is not None:  # points are in the coordinates of the images' axes
         values, grid = orientation.array(values), orientation.grid(grid)
+        near = None if near is None else orientation.array(near)
     if any(len(point) != d for point in args.points):
         raise ValueError(f"--points: got {args.points}; expected {d} coordinates per point")
     style: dict[str, Any] = {"scaled": flat, "cmap": args.cmap or "viridis", "unit": args.unit_of_t or result.unit}
+    style["near_rim"] = near
     if result.smallest_time:
         style["limit"] = result.smallest_time
     figure = new_figure(5.4, 4.0)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import equinox as eqx
@@ -12,7 +13,7 @@ from jaxtyping import Array
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.compilation import jit_quickly, numpy_where_known
-from hks_jax.eigen.adjoints.adjoint import Adjoint, OfRows, Rows, Scalar, Values, Vectors, unsolved
+from hks_jax.eigen.adjoints.complement import Adjoint, OfRows, Rows, Scalar, Values, Vectors, unsolved
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.rotations import gaps
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report
@@ -20,8 +21,8 @@ from hks_jax.fem.pencil import Pencil
 from hks_jax.linear import lapack
 from hks_jax.linear.linear_map import first_order_only, with_transpose
 from hks_jax.linear.loops import one_by_one
-from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import inner_products, matmul
+from hks_jax.linear.symmetric_pencil import SymmetricPencil
 from hks_jax.traced import is_traced
 
 OnFailure = Literal["nothing", "warning", "error"]
@@ -111,24 +112,24 @@ def _shapes(*args: Any) -> tuple[Any, Any]:
     return jax.ShapeDtypeStruct((len(functions),), functions.dtype), functions
 
 
-def _numpy_rule(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
+def _numpy_rule(known: SimpleNamespace, x: SimpleNamespace | None, y: list[Any] | None) -> Any:
     """Compute `tangents_of` by NumPy; if cotangents y of its result are given, compute the cotangent of ``change``."""
-    adjoint, on_failure, prepared, pencil, origin, _, *pairs = known
-    values, vectors, functions = map(np.asarray, pairs)
+    pencil, pairs = known.pencil, (known.values, known.vectors)
+    values, vectors, functions = map(np.asarray, (*pairs, known.functions))
     if vectors.size > _ON_HOST or x is None:
         return None
-    change, k = x[5], len(functions)
-    eigenvalues, guards = (values[:k] + np.asarray(origin))[:, None], vectors[k:]
+    change, k = x.change, len(functions)
+    eigenvalues, guards = (values[:k] + np.asarray(known.origin))[:, None], vectors[k:]
     _, inverse = gaps(np, values, k, np.asarray(indistinct(pencil, values.dtype)))
 
     def outside(rhs: np.ndarray) -> np.ndarray:
         if not _solves(pencil, k, len(values)):
             return np.zeros_like(rhs)
         free = np.arange(k)[:, None] >= pencil.n_fixed
-        given = prepared, pencil, *pairs[:2], jax.device_put(np.where(free, rhs, 0))
-        solution = np.asarray(adjoint.solve(*given))
+        free_rhs = jax.device_put(np.where(free, rhs, 0))
+        solution = np.asarray(known.adjoint.solve(known.prepared, pencil, *pairs, free_rhs))
         if np.isnan(solution).any():
-            _checked(on_failure, jax.device_put(solution))
+            _checked(known.on_failure, jax.device_put(solution))
         return np.where(free, solution, 0)
 
     def onto(force: np.ndarray) -> np.ndarray:
@@ -141,7 +142,7 @@ def _numpy_rule(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> A
     # Reverse mode is the transpose of the computation above.
     of_values, of_frame = y
     force = of_values[:, None] * functions + onto(of_frame)
-    return change_of(change, functions, force, -eigenvalues * force)
+    return {"change": change_of(change, functions, force, -eigenvalues * force)}
 
 
 def change_of(change: SymmetricPencil, x: Rows, *p: Rows) -> SymmetricPencil:

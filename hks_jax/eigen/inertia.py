@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
+from hks_jax.arrays import Scalar
 from hks_jax.checks import require_number
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.quality import largest
@@ -20,7 +21,7 @@ from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.factorised_matrix import certain_factorisation
 from hks_jax.linear.loops import while_loop
 from hks_jax.linear.multifrontal import factorise, try_out
-from hks_jax.linear.pencil import SymmetricPencil
+from hks_jax.linear.symmetric_pencil import SymmetricPencil
 from hks_jax.traced import is_traced
 
 _BESIDE = (1e-6, 1e-5, 1e-4, 1e-3)
@@ -36,7 +37,6 @@ _JUST_BELOW = 0.625
 _NARROW = 8
 """The width at which a bracket is not divided further, in units of the distance of the first shift from zero."""
 
-Scalar = Float[Array, ""]
 Number = Int[Array, ""]
 Flag = Bool[Array, ""]
 Count = tuple[Number, Flag]

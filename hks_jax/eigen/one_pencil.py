@@ -19,7 +19,7 @@ from hks_jax.fem.nodal import on_all_nodes
 from hks_jax.fem.pencil import AnyPencil, Pencil
 from hks_jax.fem.space import MatrixSpace
 from hks_jax.linear.host_matrices import balanced, near_zero
-from hks_jax.linear.pencil import SymmetricPencil, tabulated
+from hks_jax.linear.symmetric_pencil import SymmetricPencil, tabulated
 
 
 def widened(pencil: AnyPencil, solvers: Sequence[Eigensolver], k: int) -> AnyPencil:

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.compilation import numpy_where_known
-from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import products_with_columns, row_blocks
+from hks_jax.linear.symmetric_pencil import SymmetricPencil
 
 _EXCUSED = 0.01
 """The largest relative residual that is accepted as rounding."""

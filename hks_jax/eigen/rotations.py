@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.compilation import jit_quickly, numpy_where_known
-from hks_jax.eigen.adjoints.adjoint import OfRows, Rows, Scalar, Values
+from hks_jax.eigen.adjoints.complement import OfRows, Rows, Scalar, Values
 from hks_jax.eigen.quality import indistinct
 from hks_jax.fem.pencil import AnyPencil, Pencil
 from hks_jax.fem.space import FunctionSpace

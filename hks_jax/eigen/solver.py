@@ -14,11 +14,11 @@ from scipy.linalg import cholesky, eigh, solve_triangular
 
 from hks_jax.checks import require_number
 from hks_jax.compilation import is_concrete_on_cpu
-from hks_jax.eigen.adjoints.adjoint import Adjoint
+from hks_jax.eigen.adjoints.complement import Adjoint
 from hks_jax.eigen.adjoints.factorised_adjoint import FactorisedAdjoint
 from hks_jax.linear.dense_eigh import pencil_eigh
 from hks_jax.linear.host_matrices import host_matrices
-from hks_jax.linear.pencil import P, SymmetricPencil
+from hks_jax.linear.symmetric_pencil import P, SymmetricPencil
 
 FAR = 30
 """The largest distance of an origin below the wanted eigenvalues, in units of the spread of these eigenvalues."""

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import partial
 from itertools import product
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -84,31 +85,32 @@ def _points_from(
     return origin + spacing * (low[..., None, :] + inner)
 
 
-def _numpy_rule(args: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
+def _numpy_rule(known: SimpleNamespace, x: SimpleNamespace | None, y: list[Any] | None) -> Any:
     """Compute the integrals without fields, their tangents, or the cotangents of the tensors, with NumPy."""
-    tensors, domain, elements, couplings, gradients, weights, _, _, fields, periodic, interpolation, operator = args
-    plain = operator == WeakForm(lumped=operator.lumped, fick=operator.fick) and not fields
+    tensors, domain, periodic, operator = known.tensors, known.domain, known.periodic, known.operator
+    plain = operator == WeakForm(lumped=operator.lumped, fick=operator.fick) and not known.fields
     if (
         not plain
-        or interpolation != "linear"
+        or known.interpolation != "linear"
         or tensors.size > _ON_HOST
-        or (x is not None and len(jax.tree.leaves(x)) > 1)
+        or (x is not None and len(jax.tree.leaves(vars(x))) > 1)
     ):
         return None
+    gradients, weights = known.gradients, known.weights
     d, n, dtype, shape = len(periodic), 2 ** len(periodic), tensors.dtype, domain.shape
     h, nodes = tensor_product_element(d).values.astype(dtype), np.asarray(tensors).reshape(-1, d, d)
     corners = np.array(list(product((0, 1), repeat=d)))
     offsets = (corners[None] - corners[:, None] + 1) @ 3 ** np.arange(d)[::-1]
-    cells = cells_of(np.asarray(elements), shape, periodic)
+    cells = cells_of(np.asarray(known.elements), shape, periodic)
     places = cells[:, :, None] + offsets * domain.size
     of_stiffness = np.einsum("q,qia,qjb->qabij", weights, gradients, gradients).reshape(-1, n * n)
     of_mass = np.einsum("q,qi,qj->qij", weights, h, h).reshape(-1, n * n)
-    coupled = np.ones((), bool) if couplings is None else couplings
+    coupled = np.ones((), bool) if known.couplings is None else known.couplings
     # Nodes outside the domain have no influence, whatever their tensors are.
-    known = np.where(domain.ravel(), np.where(spd.is_spd(nodes), 1, np.nan), 0).astype(dtype)[:, None, None]
+    valid = np.where(domain.ravel(), np.where(spd.is_spd(nodes), 1, np.nan), 0).astype(dtype)[:, None, None]
 
     def inside(nodal: np.ndarray) -> np.ndarray:
-        at_corners = (nodal * known)[cells].reshape(-1, n, d * d)
+        at_corners = (nodal * valid)[cells].reshape(-1, n, d * d)
         return np.matmul(h, at_corners).reshape(-1, n, d, d)
 
     def integrals(flux: np.ndarray, density: np.ndarray, metric_density: np.ndarray) -> tuple[Any, ...]:
@@ -126,7 +128,7 @@ def _numpy_rule(args: list[Any], x: list[Any] | None, y: list[Any] | None) -> An
     if x is None:
         return integrals(flux, np.ones_like(root) if fick else root, 1 / root if fick else root)
     if y is None:
-        change = inside(np.asarray(x[0]).reshape(-1, d, d))
+        change = inside(np.asarray(x.tensors).reshape(-1, d, d))
         half = np.sum(across * change, axis=(-2, -1)) / 2
         if fick:
             return integrals(change, np.zeros_like(root), -half / root)
@@ -144,7 +146,7 @@ def _numpy_rule(args: list[Any], x: list[Any] | None, y: list[Any] | None) -> An
         of_tensors = half[..., None, None] * across - root[..., None, None] * across @ of_flux @ across
     of_corners = np.matmul(h.T, of_tensors.reshape(-1, n, d * d)).reshape(-1, d * d)
     sums = [np.bincount(cells.ravel(), each, domain.size) for each in of_corners.T]
-    return [(np.stack(sums, axis=-1).reshape(-1, d, d) * known).astype(dtype).reshape(tensors.shape)]
+    return {"tensors": (np.stack(sums, axis=-1).reshape(-1, d, d) * valid).astype(dtype).reshape(tensors.shape)}
 
 
 @jit_quickly(static_argnames=("periodic", "interpolation", "operator"), numpy_rule=_numpy_rule)

@@ -17,7 +17,7 @@ from hks_jax.fem.space import GridSpace, grid_space, mask_for
 from hks_jax.fem.stencil import Stencil, StencilOperator, coefficients_of
 from hks_jax.linear.chebyshev import chebyshev_iteration
 from hks_jax.linear.operators import DiagonalOperator, Operator
-from hks_jax.linear.pencil import NullSpace
+from hks_jax.linear.symmetric_pencil import NullSpace
 from hks_jax.traced import is_traced
 
 

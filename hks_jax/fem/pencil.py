@@ -17,7 +17,7 @@ from hks_jax.fem.resolution import Resolution, SampledMetric, resolution_of
 from hks_jax.fem.space import FunctionSpace, MeshSpace, VectorSpace
 from hks_jax.linear.operators import DiagonalOperator, Operator, PatternedOperator, SparseOperator
 from hks_jax.linear.pattern import SparsePattern
-from hks_jax.linear.pencil import NullSpace, SymmetricPencil
+from hks_jax.linear.symmetric_pencil import NullSpace, SymmetricPencil
 from hks_jax.traced import is_staged
 
 

@@ -25,7 +25,7 @@ from hks_jax.fem.space import MatrixSpace
 from hks_jax.linear.host_matrices import inertia_on_host
 from hks_jax.linear.operators import ROUNDING, DiagonalOperator, Operator, SparseOperator, require_symmetric
 from hks_jax.linear.pattern import SparsePattern
-from hks_jax.linear.pencil import NullSpace, SymmetricPencil
+from hks_jax.linear.symmetric_pencil import NullSpace, SymmetricPencil
 from hks_jax.traced import is_traced
 
 _FEW = 8
@@ -125,7 +125,7 @@ def _require_definite_mass(pencil: Pencil) -> None:
     own = isinstance(pencil.space, MatrixSpace) or pencil.volume is None
     if not own or isinstance(pencil.mass, DiagonalOperator) or is_traced(pencil):
         return
-    negative, sound = inertia_on_host(pencil.mass.to_scipy(), identity(pencil.size), 0.0)
+    negative, sound = inertia_on_host(pencil.mass.to_scipy().tocsc(), identity(pencil.size, format="csc"), 0.0)
     if negative or not sound:
         what = f"{negative} negative eigenvalue(s)" if sound else "an eigenvalue that is zero within rounding"
         name = "M" if isinstance(pencil.space, MatrixSpace) else "mass"

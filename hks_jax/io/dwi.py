@@ -150,7 +150,7 @@ def fit_dwi(
     b, directions, remarks = _directed(os.fspath(bvec), b, directions, images)
     largest = float(b.max()) or 1.0
     design = _design(b / largest, directions)  # the unknown components are multiplied by the largest b-value
-    _require_determined(table, design, b, directions, b_max)
+    _require_determined(table, design, b, b_max)
     if noise == "residuals" and b.size <= _UNKNOWNS:
         raise ValueError(
             f'noise: got "residuals" with {b.size} images, but a tensor and the unweighted signal are {_UNKNOWNS} '
@@ -222,15 +222,14 @@ def _require_determined(
     table: str,
     design: Float[np.ndarray, "n 7"],
     b: Float[np.ndarray, " n"],
-    directions: Float[np.ndarray, "n 3"],
     b_max: float | None,
 ) -> None:
     """Raise ValueError unless the images determine a tensor and the unweighted signal."""
     rank = _rank(design)
     if rank == _UNKNOWNS:
         return
-    of_directions = _rank(_design(np.ones(b.size), directions)[:, :6])
-    if of_directions < 6:
+    of_directions = _rank(design[:, :6])  # tables may have directions at b = 0, too
+    if 0 < of_directions < 6:
         missing = (
             f"The gradient directions determine {of_directions} of a tensor's 6 components; expected at least six axes "
             "that lie neither in a plane nor on a cone, where opposite directions are the same axis"
@@ -238,7 +237,7 @@ def _require_determined(
     else:
         missing = (
             f"The b-values {b.min():g} to {b.max():g} s/mm² do not separate the mean diffusivity from the unweighted "
-            "signal; expected images of another b-value too, such as b = 0"
+            f"signal; expected images of another b-value too, such as b = {0 if b.max() > 100 else 1000}"
         )
     where = table if b_max is None else f"b_max: got {b_max:g}"
     raised = ". Raise the limit, if the scan has such images" * (b_max is not None)

@@ -28,6 +28,8 @@ READ = (".vtk", ".vtu", ".vtp", ".msh", ".ply", ".stl", ".obj", ".off", ".gii", 
 """The suffixes of meshes. FreeSurfer's surfaces have no suffix and are recognised by their first bytes."""
 WRITTEN = {".vtu": "vtu", ".vtk": "vtk", ".msh": "gmsh", ".ply": "ply"}
 """The suffixes of formats with values at vertices, and meshio's names of the formats. PLY has only triangles."""
+_RESERVED = {".ply": ("x", "y", "z", "end_header"), ".vtk": ("METADATA",)}
+"""The names that have another meaning in a format."""
 _NEAR = 1e-8
 """The distance up to which vertices count as coincident, relative to the size of the mesh."""
 _THIN = 1e-7
@@ -87,8 +89,8 @@ def read_mesh_arrays(
 ) -> dict[str, Float[np.ndarray, "n *components"]]:
     """Read the named arrays at the vertices or the cells of a mesh, such as tensors or the signatures of `save`.
 
-    Only ``.vtk``, ``.vtu``, ``.vtp``, ``.msh`` and ``.ply`` have arrays; other files give an empty result. Arrays at
-    the cells of polygonal data (``.vtp``, and polygonal data in ``.vtk``) are not read.
+    Only ``.vtk``, ``.vtu``, ``.vtp``, ``.msh`` and ``.ply`` have arrays; other files give an empty result. Arrays in
+    ``.msh`` may lack values at some vertices or cells; there the result is NaN.
 
     Args:
         path: the file.
@@ -149,6 +151,8 @@ def write(path: Path, arrays: Mapping[str, Float[np.ndarray, " V"]], mesh: Simpl
     if suffix not in allowed:
         what = "values at the vertices of tetrahedra" if solid else "values at vertices"
         raise ValueError(f"path: got {str(path)!r}; {what} can be written as {', '.join(allowed)} or .npz")
+    if reserved := [name for name in arrays if name in _RESERVED.get(suffix, ())]:
+        raise ValueError(f"name: got {reserved[0]!r}, which has another meaning in {suffix}; choose another name")
     library = optional("meshio")
     cells = [("tetra" if solid else "triangle", mesh.triangulation.cells.astype(np.int32))]  # PLY has no int64
     whole = library.Mesh(np.asarray(mesh.vertices), cells, point_data={k: np.asarray(v) for k, v in arrays.items()})

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from hks_jax.accuracy import warn_of_accuracy
+from hks_jax.io import gmsh
 from hks_jax.io.vtk_image import load as through_vtk
 from hks_jax.optional import optional
 from hks_jax.storage import reading
@@ -46,7 +46,7 @@ def through_meshio(path: Path) -> Loaded:
         declared = _declared(content, suffix)
         pieces = _pieces(content) if suffix == ".vtu" else []
         if suffix == ".msh":
-            read = _gmsh(path, library, content)
+            read = _gmsh(library, content)
         else:
             read = _joined(library, content, pieces) if len(pieces) > 1 else _read(library, content, suffix)
         _compare(content, suffix, declared, read)
@@ -75,6 +75,8 @@ def through_meshio(path: Path) -> Loaded:
         name: np.concatenate([np.repeat(values, n, axis=0) for values, n in zip(of_parts, times, strict=True)])
         for name, of_parts in of_blocks.items()
     }
+    if suffix == ".msh":  # other arrays have values only at other elements
+        of_cells = {name: values for name, values in of_cells.items() if not np.isnan(values).all()}
     return Loaded(points, cells, arrays, real_arrays(of_cells, len(cells)))
 
 
@@ -91,24 +93,15 @@ def _read(library: Any, content: bytes, suffix: str) -> Any:
         return getattr(library, "gmsh" if suffix == ".msh" else suffix[1:]).read(str(file))
 
 
-def _gmsh(path: Path, library: Any, content: bytes) -> Any:
-    """Read a Gmsh file; without its arrays at cells, with a warning, if meshio cannot read them.
-
-    meshio 5.3 cannot read arrays at the cells of several kinds, or at some of the cells.
-    """
-    try:
-        return _read(library, content, ".msh")
-    except (Exception, SystemExit):
-        bare = re.sub(rb"^\$ElementData\b.*?^\$EndElementData\b", b"", content, flags=re.DOTALL | re.MULTILINE)
-        if bare == content:
-            raise
-        read = _read(library, bare, ".msh")
-    warn_of_accuracy(
-        f"{path}: the arrays at the cells ($ElementData) are not read, because meshio reads them only for cells of one "
-        "kind with values at every cell. To use them, write the mesh as .vtu",
-        UserWarning,
-    )
-    return read
+def _gmsh(library: Any, content: bytes) -> Any:
+    """Read a Gmsh file by meshio, and its arrays by their tags."""
+    bare, sections = gmsh.split(content)
+    read = _read(library, bare, ".msh")
+    sizes = [len(block.data) for block in read.cells]
+    corners = np.repeat([block.data.shape[1] for block in read.cells], sizes)
+    at_nodes, at_elements = gmsh.arrays(content, sections, corners)
+    of_cells = {name: np.split(values, np.cumsum(sizes)[:-1]) for name, values in at_elements.items()}
+    return library.Mesh(read.points, read.cells, at_nodes, of_cells)
 
 
 _ATTRIBUTE = re.compile(rb"^(TENSORS6|NORMALS)[ \t]+(\S+)[ \t]+(\w+)[ \t]*\r?\n", re.MULTILINE | re.IGNORECASE)
@@ -150,9 +143,8 @@ def _joined(library: Any, content: bytes, pieces: list[re.Match[bytes]]) -> Any:
     return library.Mesh(whole.points, blocks, whole.point_data, of_cells)
 
 
-_GMSH = re.compile(rb"\s*(?:\$Comments.*?\$EndComments\s*)?\$MeshFormat\s+(\S+)\s+([01])\s+([48])\b", re.DOTALL)
 _COUNTS = {
-    ".vtk": (rb"\bPOINTS\s+(-?\d+)", rb"\bCELL_TYPES\s+(-?\d+)"),
+    ".vtk": (rb"\bPOINTS\s+(-?\d+)\s+[a-zA-Z]", rb"\bCELL_TYPES\s+(-?\d+)[ \t]*[\r\n]"),
     ".vtu": (rb"NumberOfPoints\s*=\s*[\"'](-?\d+)", rb"NumberOfCells\s*=\s*[\"'](-?\d+)"),
 }
 """Patterns of the declared numbers of points and cells in each format. For .stl, meshio checks the file's length."""
@@ -171,7 +163,7 @@ def _declared(content: bytes, suffix: str) -> tuple[int, ...]:
         sizes = [int(size) for size in grid[1].split()]
         declared = (math.prod(sizes), math.prod(size - 1 for size in sizes if size > 1))
     if suffix == ".msh":
-        declared = _declared_by_gmsh(content)
+        declared = gmsh.declared(content)
     if max(declared, default=0) > 8 * len(content):
         raise ValueError(f"the file declares {max(declared)} points or cells, but has only {len(content)} bytes")
     return declared
@@ -191,47 +183,19 @@ def _compare(content: bytes, suffix: str, declared: tuple[int, ...], mesh: Any) 
             raise ValueError(f"the file lists {listed} corners, but cells of the declared types have {corners}")
 
 
-def _declared_by_gmsh(content: bytes) -> tuple[int, int, int]:
-    """Return the declared numbers of nodes and elements, and the largest node tag, the length of an array in meshio."""
-    head = _GMSH.match(content)
-    if head is None or head[1] not in (b"2", b"2.2", b"4", b"4.1"):
-        version = "no Gmsh format" if head is None else f"Gmsh format {head[1].decode(errors='replace')}"
-        raise ValueError(f"got {version}; expected 2.2 or 4.1. Convert the file by gmsh -format msh41")
-    text, width = head[2] == b"0", int(head[3])
-    nodes, elements = (_section(content, name) for name in (b"Nodes", b"Elements"))
-    if head[1].startswith(b"4"):
-        (_, n_nodes, _, largest), (_, n_elements, _, _) = (
-            map(int, each.split(maxsplit=4)[:4] if text else np.frombuffer(each[: 4 * width], f"<u{width}"))
-            for each in (nodes, elements)
-        )
-    else:
-        n_nodes, n_elements = (int(each.partition(b"\n")[0]) for each in (nodes, elements))
-        for each, declared in ((nodes, n_nodes), (elements, n_elements)) if text else ():
-            there = sum(1 for line in each.splitlines()[1:] if line.strip())
-            if there != declared:  # meshio ignores further lines
-                raise ValueError(f"the file declares {declared} nodes or elements, but has {there} lines for them")
-        rows, node = nodes.partition(b"\n")[2], np.dtype("<i4, (3,)<f8")
-        tags = map(int, rows.split()[::4]) if text else np.frombuffer(rows[: n_nodes * node.itemsize], node)["f0"]
-        largest = int(max(tags, default=0))
-    return n_nodes, n_elements, largest
-
-
-def _section(content: bytes, name: bytes) -> bytes:
-    start, end = re.search(rb"\$" + name + rb"[ \t]*\r?\n", content), content.rfind(b"$End" + name)
-    if start is None or end < start.end():
-        raise ValueError(f"the file has no complete section ${name.decode()}")
-    return content[start.end() : end]
-
-
 def polygonal(path: Path) -> Loaded:
     """Load polygonal data through VTK, with polygons cut into triangles."""
     with reading(path, "readable polygonal data"):
         data = through_vtk(path)
         if "faces" not in data:
             raise ValueError(f"got {data['kind']}; expected vtkPolyData")
-        points = data["points"].astype(np.float64)
-    arrays = {key.removeprefix("point:"): values for key, values in data.items() if key.startswith("point:")}
-    return Loaded(points, data["faces"].astype(np.int64), real_arrays(arrays, len(points)))
+        points, faces = data["points"].astype(np.float64), data["faces"].astype(np.int64)
+        at_points, at_cells = (
+            {key.removeprefix(place): values for key, values in data.items() if key.startswith(place)}
+            for place in ("point:", "cell:")
+        )
+        of_faces = {name: values[data["cells_of_faces"]] for name, values in at_cells.items()}
+    return Loaded(points, faces, real_arrays(at_points, len(points)), real_arrays(of_faces, len(faces)))
 
 
 def real_arrays(named: Mapping[str, Any], n: int) -> dict[str, Float[np.ndarray, "n *components"]]:

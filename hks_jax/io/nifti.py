@@ -151,6 +151,8 @@ def read_tensors(name: str, order: str | None, frame: str | None, image: Any = N
         notes.append(f'components read in order "{order}", as asked; the file declares NIfTI\'s symmetric-matrix order')
     by_sidecar = _REFERENCES.get(encoding.get("Reference", ""))
     declared_frame = record.get("frame", by_sidecar)
+    if declared_frame not in (None, "voxel", "fsl", "world"):
+        raise ValueError(f'{name}: the header declares {declared_frame!r} axes; expected "voxel", "fsl" or "world"')
     if by_sidecar not in (None, declared_frame):  # the sidecar may describe an earlier image of the same name
         notes.append(
             f"the {by_sidecar} axes of the sidecar are ignored, because the image declares {declared_frame} axes"

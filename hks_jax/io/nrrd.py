@@ -279,7 +279,10 @@ def _placement(name: str, header: Mapping[str, Any], domain: list[int]) -> Place
         raise ValueError(
             f"{name}: got space directions {rows[domain].tolist()}; expected {d} nonzero vectors of {d} finite numbers"
         )
-    origin = scales * np.nan_to_num(np.asarray(header.get("space origin", np.zeros(d)), np.float64))
+    origin = np.asarray(header.get("space origin", np.zeros(d)), np.float64)
+    if origin.shape != (d,):
+        raise ValueError(f"{name}: got space origin {origin.tolist()}; expected {d} numbers")
+    origin = scales * np.nan_to_num(origin)
     signs = _PATIENT.get(_space_of(header)) if d == 3 else None
     to_ras = None if signs is None else np.array(signs)
     return Placement(scales[:, None] * directions, origin, to_ras, frame, True, unit)

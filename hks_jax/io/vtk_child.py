@@ -21,8 +21,8 @@ def image(data: Any) -> dict[str, Any]:
 
 
 def surface(data: Any) -> dict[str, Any]:
-    """Return the points of polygonal data, and the triangles of their polygons and strips."""
-    from vtkmodules.util.numpy_support import vtk_to_numpy
+    """Return the points of polygonal data, and the triangles of their polygons and strips with their cells."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
     from vtkmodules.vtkFiltersCore import vtkTriangleFilter
 
     for cells in (data.GetPolys(), data.GetStrips()):
@@ -38,12 +38,17 @@ def surface(data: Any) -> dict[str, Any]:
     cut = vtkTriangleFilter()
     cut.PassLinesOff()
     cut.PassVertsOff()
-    cut.SetInputData(data)
+    numbered = data.NewInstance()
+    numbered.ShallowCopy(data)
+    numbered.GetCellData().Initialize()
+    numbered.GetCellData().SetScalars(numpy_to_vtk(np.arange(data.GetNumberOfCells()), deep=True))
+    cut.SetInputData(numbered)
     cut.Update()
     if not cut.GetOutput().GetNumberOfPolys():
         raise ValueError("the file has no triangles")
     faces = vtk_to_numpy(cut.GetOutput().GetPolys().GetConnectivityArray()).reshape(-1, 3)
-    return {"points": vtk_to_numpy(cut.GetOutput().GetPoints().GetData()), "faces": faces}
+    points, cells = cut.GetOutput().GetPoints().GetData(), cut.GetOutput().GetCellData().GetScalars()
+    return {"points": vtk_to_numpy(points), "faces": faces, "cells_of_faces": vtk_to_numpy(cells)}
 
 
 def main(path: str, output: str, room: str) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float, Int
 
+from hks_jax.arrays import Scalar
 from hks_jax.linear import accelerators, lapack
 from hks_jax.linear.products import aligned, matmul
 
@@ -18,7 +19,6 @@ _FAILURE = 1e-6
 _START = 30
 """The safety factor of `lanczos_bound` for start vectors with covariance D instead of P⁻¹, at least √cond(PD)."""
 
-Scalar = Float[Array, ""]
 Columns = Float[Array, "*shape b"]
 
 

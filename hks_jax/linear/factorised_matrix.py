@@ -12,14 +12,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.arrays import jax_array
+from hks_jax.arrays import Scalar, jax_array
 from hks_jax.checks import real_array
 from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.multifrontal import Factorisation, Trial, eliminate, factorise, try_out
 from hks_jax.linear.operators import DiagonalOperator, OfColumns, PatternedOperator
-from hks_jax.linear.pencil import SymmetricPencil, tabulated
 from hks_jax.linear.selected_inversion import Eliminated, inverse_entries, selected
 from hks_jax.linear.symmetric_inverse import symmetric_inverses
+from hks_jax.linear.symmetric_pencil import SymmetricPencil, tabulated
 from hks_jax.traced import is_traced
 
 _PROBES = 4
@@ -36,7 +36,6 @@ _SEARCHED, _TURNS = 16, 4
 """The largest number of null vectors that an error message reports, and the number of iterations that compute them."""
 
 
-Scalar = Float[Array, ""]
 Columns = Float[Array, "n m"]
 
 

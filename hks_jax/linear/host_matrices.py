@@ -12,7 +12,7 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from hks_jax.linear.multifrontal import CONTRACTION
 from hks_jax.linear.operators import Places
-from hks_jax.linear.pencil import SymmetricPencil
+from hks_jax.linear.symmetric_pencil import SymmetricPencil
 
 _EXACT = 1e-13
 """The sum of a row of K, relative to the sizes of the entries, up to which the sum is zero in double precision."""

@@ -16,17 +16,17 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Inexact, Int
 
+from hks_jax.arrays import Scalar
 from hks_jax.compilation import jit_quickly
 from hks_jax.linear import lapack
 from hks_jax.linear.dissection import Dissection, Level, Merged
-from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import batched_with_columns, gram, matmul
 from hks_jax.linear.symmetric_inverse import symmetric_inverses
+from hks_jax.linear.symmetric_pencil import SymmetricPencil
 
 CONTRACTION = 0.1
 """The largest convergence rate of iterative refinement at which the inertia of a factorisation is accepted."""
 
-Scalar = Float[Array, ""]
 Blocks = tuple[Array, ...]
 """A batch of dense blocks for each level."""
 

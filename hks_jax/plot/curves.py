@@ -6,21 +6,25 @@ from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Real
+from jaxtyping import Bool, Real
 from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
+from hks_jax.domain.components import as_mask
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_checks import require_grid
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.eigenpairs import Eigenpairs, require_pairs
 from hks_jax.eigen.weyl import weyl_count
-from hks_jax.plot.figure import SMALL, number_text
+from hks_jax.plot.figure import RIM_NOTE, SMALL, number_text
 from hks_jax.plot.panels import checked_times
+
+PALE = 0.35
+"""The opacity of the parts of curves that the boundary influences."""
 
 
 def hks_curves(
@@ -32,6 +36,7 @@ def hks_curves(
     *,
     expansion: Real[ArrayLike, "n_times *shape"] | None = None,
     limit: float | None = None,
+    near_rim: Bool[ArrayLike, "n_times *shape"] | None = None,
     labels: Sequence[str] | None = None,
     unit: str = "",
     scaled: bool = False,
@@ -48,11 +53,15 @@ def hks_curves(
         points: (n, d) coordinates, one row for each curve.
         expansion: (n_times, *shape) the result of `hks_jax.hks_expansion`.
         limit: the smallest resolved time, `hks_jax.truncation(pairs, times).smallest_time`; smaller times are shaded.
+        near_rim: (n_times, *shape) where curves are pale, such as where `hks_jax.boundary_influence` exceeds 0.1.
         labels: a label for each point, by default its coordinates.
         unit: the unit of t.
         scaled: whether to draw (4πt)^(d/2)·HKS, which is 1 for flat space without boundary, on a linear scale.
         cmap: a colour map, from which the curves take evenly spaced colours.
         **kwargs: arguments of `Axes.plot` for the HKS.
+
+    Returns:
+        A line for each point, whose values are NaN where the curve is pale.
 
     Raises:
         ValueError: if shapes disagree, or if the nearest node of a point is outside the mask.
@@ -64,7 +73,7 @@ def hks_curves(
         True
     """
     require_grid(grid)
-    t = checked_times(times, grid.shape, values=values, expansion=expansion)
+    t = checked_times(times, grid.shape, values=values, expansion=expansion, near_rim=near_rim)
     curves = np.moveaxis(np.asarray(values, dtype=np.float64), 0, -1)
     series = None if expansion is None else np.moveaxis(np.asarray(expansion, dtype=np.float64), 0, -1)
     nodes = _nearest_nodes(np.asarray(points, dtype=np.float64), grid)
@@ -78,10 +87,14 @@ def hks_curves(
     if t.max() < 100 * t.min():  # by default, Matplotlib labels so many ticks that the labels overlap
         ax.xaxis.set(major_locator=LogLocator(subs=(1, 2, 5)), minor_formatter=NullFormatter())
         ax.xaxis.set_major_formatter(lambda value, _: number_text(value))
+    rim = None if near_rim is None else np.moveaxis(as_mask("near_rim", near_rim), 0, -1)
+    pale = [np.zeros(t.size, bool) if rim is None else rim[node] for node in nodes]
     lines = []
-    for node, label, colour in zip(nodes, labels, colours, strict=True):
+    for node, label, colour, faint in zip(nodes, labels, colours, pale, strict=True):
         style = {"color": colour, "label": label, "marker": "o" if t.size == 1 else "", **kwargs}
-        lines += ax.plot(t, factor * curves[node], **style)
+        lines += ax.plot(t, np.where(faint, np.nan, factor * curves[node]), **style)
+        if faint.any():
+            ax.plot(t, factor * curves[node], **{**style, "alpha": PALE, "label": "_pale"})
     limits = ax.get_ylim()  # the expansion diverges at large t, so it does not set the limits
     if series is not None:
         for node, line in zip(nodes, lines, strict=True):
@@ -93,6 +106,8 @@ def hks_curves(
     handles: list[Artist] = list(lines)
     if series is not None:
         handles.append(Line2D([], [], color="0.3", linestyle="--", linewidth=1.0, label="expansion"))
+    if np.any(pale):
+        handles.append(Line2D([], [], color="0.3", alpha=PALE, label=f"pale: {RIM_NOTE}"))
     if limit is not None and limit > ax.get_xlim()[0]:
         end = min(limit, ax.get_xlim()[1])
         handles.append(ax.axvspan(ax.get_xlim()[0], end, color="0.88", linewidth=0, zorder=0, label="unresolved $t$"))

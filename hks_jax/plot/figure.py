@@ -18,9 +18,12 @@ from matplotlib.transforms import ScaledTranslation
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_checks import require_grid
 from hks_jax.domain.tensor_field import require_field
+from hks_jax.signatures.times import FREE
 from hks_jax.storage import atomic_path
 
 SMALL = "small"
+RIM_NOTE = f"the boundary contributes over {100 * FREE:.0f} %"
+"""What legends say of nodes near the boundary."""
 LABELS = 21
 """The height of tick labels and an axis label below the axes, in points (1/72 inch)."""
 

@@ -13,12 +13,11 @@ from hks_jax import Grid
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result, require_result
 from hks_jax.io.units import MM2_PER_S
-from hks_jax.plot.figure import number_text
+from hks_jax.plot.figure import RIM_NOTE, number_text
 from hks_jax.plot.images import FADED, FADED_NOTE, Colours, colours_of
 from hks_jax.plot.orientation import Orientation, View
 from hks_jax.plot.panels import hks_panels, panel_titles
 from hks_jax.plot.volumes import volume_panels
-from hks_jax.signatures.times import FREE
 
 ENOUGH = 0.1
 """The share of free nodes above which the range of colours is that of the nodes free of the boundary."""
@@ -113,7 +112,7 @@ def legend(result: Result, near: Bool[np.ndarray, "n_times *shape"] | None) -> l
         unit = f" {MM2_PER_S}" * (result.unit == "s")
         words.append(f"D = {number_text(result.diffusivity)}{unit}, the median mean diffusivity")
     if near is not None and near.any():
-        words.append(f"hatched: the boundary contributes over {100 * FREE:.0f} %")
+        words.append(f"hatched: {RIM_NOTE}")
     return words if result.z is None else [*words, FADED_NOTE]
 
 

@@ -3,6 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import equinox as eqx
@@ -124,13 +125,13 @@ def shapes(contraction: Contraction, filters: Filter, pairs: tuple[Array, Array,
     return jax.eval_shape(contraction.weighted, jax.ShapeDtypeStruct((m, len(vectors)), vectors.dtype), vectors)
 
 
-def by_numpy(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
+def by_numpy(known: SimpleNamespace, x: SimpleNamespace | None, y: list[Any] | None) -> Any:
     """Compute the derivative of a kernel's diagonal, or its transpose, with NumPy; return None if JAX should."""
-    contraction, filters, pairs, _, selection, fixed, copies, space, _, reader = known
-    values, vectors, kept = map(np.asarray, pairs)
+    filters, selection, copies, space = known.filters, known.selection, known.copies, known.space
+    values, vectors, kept = map(np.asarray, known.pairs)
     k = len(values) if selection is None else len(selection[0])
     m = len(jax.tree.leaves(filters)[0])
-    plain = isinstance(contraction, Diagonal) and reader is None and k > 0
+    plain = isinstance(known.contraction, Diagonal) and known.reader is None and k > 0
     if x is None or not plain or vectors.size > _ON_HOST or m * k * k > _ON_HOST:
         return None
     rows: Any = slice(None)
@@ -138,9 +139,9 @@ def by_numpy(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
         rows, own = map(np.asarray, selection)
         values, kept, vectors = values[rows], kept[rows], np.where(own[:, None], vectors[rows], 0)
     weights, of_f, of_lambda_f, matters = map(
-        np.asarray, mixing(filters, jax.device_put(values), jax.device_put(kept), fixed)
+        np.asarray, mixing(filters, jax.device_put(values), jax.device_put(kept), known.fixed)
     )
-    change = x[8]
+    change = x.change
     # For each filter, the matrix entry (i, j) is negligible unless i < n or j < n. The matrices are symmetric, so a sum
     # over i < n and all j is enough, if its terms with j ≥ n count twice.
     last = [int(np.max(np.flatnonzero(one), initial=-1)) + 1 for one in matters]
@@ -153,7 +154,7 @@ def by_numpy(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
     if y is None:
         images = ((matrix.to_scipy() @ moved.T).T for matrix in (change.stiffness, change.mass))
         stiffness, mass = (copies * transferred(each, change.space, space) @ vectors.T for each in images)
-        d_frame = np.where(kept[:, None], np.asarray(x[3])[rows], 0)
+        d_frame = np.where(kept[:, None], np.asarray(x.d_frame)[rows], 0)
         result = weights @ (2 * vectors * d_frame)
         for one, (n, count) in enumerate(zip(last, times, strict=True)):
             matrix = (of_f[one] * stiffness - of_lambda_f[one] * mass)[:n] * count
@@ -165,7 +166,7 @@ def by_numpy(known: list[Any], x: list[Any] | None, y: list[Any] | None) -> Any:
         outer = (vectors[:n] * y[0][one]) @ vectors.T * count
         stiffness[:n] += of_f[one, :n] * outer
         mass[:n] -= of_lambda_f[one, :n] * outer
-    d_frame = np.zeros(x[3].shape, x[3].dtype)
+    d_frame = np.zeros(x.d_frame.shape, x.d_frame.dtype)
     d_frame[rows] = np.where(kept[:, None], 2 * vectors * (weights.T @ y[0]), 0)
     images = (transferred(copies * each @ vectors, space, change.space) for each in (stiffness, mass))
-    return d_frame, change_of(change, moved, *images)
+    return {"d_frame": d_frame, "change": change_of(change, moved, *images)}

@@ -20,6 +20,7 @@ from scipy.special import fdtri
 
 import hks_jax as hj
 from hks_jax.plot.signature import cropped, placed
+from hks_jax.signatures.times import FREE
 
 jax.config.update("jax_enable_x64", True)
 
@@ -152,11 +153,13 @@ def study(volumes: list[hj.io.TensorVolume], z: int) -> tuple[dict, dict]:
         "hks": rows,
         "others": table,
     }
-    return numbers, {"grid": grid, "bars": bars, "times": times, "plane": planes[0]}
+    pairs = hj.eigenpairs(hj.TensorField.from_diffusion(grid, planes[0].tensors, "inverse"), **SETTINGS)
+    near = np.asarray(hj.boundary_influence(pairs, times)) >= FREE
+    return numbers, {"grid": grid, "bars": bars, "near": near, "plane": planes[0]}
 
 
-def draw(path: Path, grid: hj.Grid, bars: list[hj.Uncertainty], times: np.ndarray, plane: hj.io.TensorVolume) -> None:
-    """Draw both halves without fading, and below the whole with it."""
+def draw(path: Path, grid: hj.Grid, bars: list[hj.Uncertainty], near: np.ndarray, plane: hj.io.TensorVolume) -> None:
+    """Draw both halves without fading, and below the whole with it; hatch the nodes near the boundary."""
     first, second = bars[1:]
     shown, chosen = bars[0], [0, 1, 3, 5]
     figure = hj.plot.new_figure(12, 10.2)
@@ -169,8 +172,8 @@ def draw(path: Path, grid: hj.Grid, bars: list[hj.Uncertainty], times: np.ndarra
             value = np.asarray(shown.value[i])
             reach = float(np.nanquantile(np.abs(value - 1), 0.97))
             z = np.asarray(shown.z()[i])[box] if each is shown else None
-            colours = {"vmin": 1 - reach, "vmax": 1 + reach, "cmap": "RdBu_r"}
-            hj.plot.scalar_image(ax, np.asarray(each.value[i])[box], small, orientation=orientation, z=z, **colours)
+            style = {"vmin": 1 - reach, "vmax": 1 + reach, "cmap": "RdBu_r", "orientation": orientation}
+            hj.plot.scalar_image(ax, np.asarray(each.value[i])[box], small, z=z, hatched=near[i][box], **style)
             ax.set_title(rf"{name}, $\sqrt{{Dt}}$ = {LENGTHS[i]:.2g} voxels", fontsize="small")
             ax.set_axis_off()
     hj.plot.save_figure(figure, path)

@@ -6,37 +6,25 @@ python notebooks/brains/explore_page.py [-o docs/images/explore.png]
 import argparse
 import sys
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
-import jax
-import numpy as np
-
 import hks_jax as hj
+from hks_jax.cli import main as hks_jax
 from hks_jax.cli.demo import B_MAX, RIM
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from browser import Browser
 
-BOUNDARY, PAIRS = "mean", 400
-LENGTHS = np.geomspace(4, 40, 24)  # √(Dt), mm
 
-
-def write_page(path: Path) -> None:
-    """Write the page of a slice of the brain that the demo shows."""
+def write_page(folder: Path) -> Path:
+    """Write the page of a slice of the brain that the demo shows, and return its path."""
     brain = hj.io.find_example_brain()
     assert brain is not None, "pip install --no-deps mdt==1.2.7"
-    plane = hj.io.fit_dwi(brain.images, brain.bval, brain.bvec, brain.mask, b_max=B_MAX).slice("z", 0)
-    plane = replace(plane, mask=hj.io.erode(plane.inside, RIM))
-    grid = plane.grid("largest")
-    field = hj.TensorField.from_diffusion(grid, plane.tensors.astype(float), metric="inverse")
-    diffusivity = np.median(np.trace(plane.tensors[grid.inside], axis1=-2, axis2=-1)) / 2
-    times = LENGTHS**2 / diffusivity
-    pairs = hj.eigenpairs(field, PAIRS, boundary=BOUNDARY)
-    values, eigenvalues = (np.asarray(array) for array in (hj.hks(pairs, times), pairs.eigenvalues))
-    report = {"settings": {"metric": "inverse", "boundary": BOUNDARY}}
-    result = hj.io.Result(plane.with_mask(grid.mask), values, times, eigenvalues, report)
-    hj.plot.explore(result, path, title="A brain slice")
+    words = [brain.images, "--bval", brain.bval, "--bvec", brain.bvec, "--mask", brain.mask, "--b-max", B_MAX]
+    words += ["--slice", "z=0", "--erode", RIM, "--components", "largest", "--metric", "inverse", "-k", 600]
+    assert hks_jax(["hks", *map(str, words), "-o", str(folder), "--times", "auto:24"]) == 0
+    assert hks_jax(["explore", str(folder), "--title", "A brain slice"]) == 0
+    return folder / "explore.html"
 
 
 def main() -> None:
@@ -44,12 +32,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/images/explore.png"))
     args = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        write_page(folder / "page.html")
         with Browser(folder / "browser", 1240, 1330) as browser:
-            browser.open(folder / "page.html")
+            browser.open(write_page(folder / "out"))
             browser.choose("#time", "8")
             browser.click("#signature", 0.362, 0.495)
             browser.click("#signature", 0.641, 0.495, shift=True)

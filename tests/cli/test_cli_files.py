@@ -147,6 +147,11 @@ def test_the_times_that_info_names_are_those_of_the_spectrum(tmp_path, capsys):
     depth = (a + b - np.sqrt(a**2 + b**2)) / 4  # (a − 2d)(b − 2d) = ab/2, and exp(−d²/t) = 1/10
     assert suits["largest_time"] == pytest.approx(depth**2 / np.log(10), rel=0.1)
     assert suits["least_time"] == pytest.approx(6 * max(2 * 0.1**2, 0.5 * 0.2**2))
+    for nodes, told in (80, False), (20, True):  # a sixteenth of the area, with the same spacing
+        np.savez(tmp_path / "n.npz", tensors=metric[: 3 * nodes // 4, :nodes], spacing=[0.1, 0.2])
+        assert main(["info", str(tmp_path / "n.npz")]) == 0
+        (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("metric tensor"))
+        assert line.endswith("No t satisfies both: the domain has too few nodes") == told
     needed = np.searchsorted(eigenvalues, 4.6 / suits["least_time"])
     assert suits["k_for_least_time"] == pytest.approx(needed, rel=0.2)
 
@@ -193,6 +198,10 @@ def test_info_of_invalid_tensors_and_meshes(tmp_path, capsys):
     volume = f"volume            {float(hj.assemble(ball).volume):.5g}"
     for line in ("vertices          147", "tetrahedra        540", "boundary vertices 92", volume):
         assert f"{line}\n" in text
+    sphere = hj.examples.sphere_mesh(6)
+    meshio.Mesh(np.asarray(sphere.vertices), [("triangle", np.asarray(sphere.faces))]).write(tmp_path / "s.vtu")
+    assert main(["info", str(tmp_path / "s.vtu")]) == 0
+    assert capsys.readouterr().out.endswith(", at which √t is half of the largest extent\n")  # it has no boundary
     assert "absent.nii: no such file" in error_of(capsys, ["info", str(tmp_path / "absent.nii")])
 
 

@@ -14,8 +14,7 @@ from fields import flat, random_spd
 import hks_jax as hj
 from hks_jax.eigen.lanczos import krylov_basis as bases
 from hks_jax.eigen.lanczos.block_lanczos import expected
-from hks_jax.eigen.lanczos.slicing import cut, search
-from hks_jax.eigen.lanczos.slicing_state import Plan, crowded, first_state, make_room
+from hks_jax.eigen.lanczos.slicing import SlicingPlan, crowded, cut, first_state, make_room, search
 from hks_jax.linear import accelerators
 from hks_jax.linear.dissection import dissect
 from hks_jax.linear.multifrontal import factorise
@@ -196,7 +195,7 @@ def test_a_block_becomes_orthonormal(rng):
 
 
 def test_eigenvalues_found_beyond_those_wanted_are_forgotten():
-    plan = Plan(wanted=5, block=2, slice_size=5, max_slices=9, tolerance=1e-8, nulls=1)
+    plan = SlicingPlan(wanted=5, block=2, slice_size=5, max_slices=9, tolerance=1e-8, nulls=1)
     values = jnp.asarray(np.random.default_rng(0).permutation(plan.capacity).astype(float))
     problem = expected(hj.assemble(flat((12, 12), (1.0, 1.0))), plan)
     state, _ = jax.eval_shape(partial(first_state, plan=plan), problem)

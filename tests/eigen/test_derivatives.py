@@ -16,7 +16,7 @@ from differences import directional, heat_kernel_by_contour
 from fields import random_spd
 
 import hks_jax as hj
-from hks_jax.eigen.adjoints.adjoint import attainable
+from hks_jax.eigen.adjoints.complement import attainable
 from hks_jax.eigen.adjoints.factorised_adjoint import FactorisedAdjoint
 from hks_jax.linear.dissection import dissect
 

@@ -96,6 +96,7 @@ def test_compressed_data_of_nrrd_are_read_to_the_checksum(tmp_path, volume, rng)
         (b"sizes: 7 5", b"sizes: 99999999999 5"),
         (b"kinds: 3D", b"kinds: none 3D"),
         (b"(2", b"(\xb2"),
+        (b"space origin: (", b"space origin: (1,"),
     ],
 )
 def test_damaged_headers_of_nrrd(tmp_path, volume, old, new):
@@ -103,6 +104,13 @@ def test_damaged_headers_of_nrrd(tmp_path, volume, old, new):
     whole = path.read_bytes()
     assert old in whole
     assert refused(hj.io.read_tensors, path, whole.replace(old, new, 1))
+
+
+def test_axes_that_nifti_does_not_know(tmp_path, volume):
+    path = hj.io.save_tensors(tmp_path / "t.nii", volume)
+    whole = path.read_bytes()
+    assert b'"voxel"' in whole
+    assert refused(hj.io.read_tensors, path, whole.replace(b'"voxel"', b'"v/xel"'))
 
 
 def test_nifti_whose_header_contradicts_its_length(tmp_path, volume):

@@ -147,6 +147,19 @@ def test_names_that_no_format_can_hold_are_refused_by_all(tmp_path, suffix):
     np.testing.assert_array_equal(arrays["FA_1.5-x"], values)
 
 
+@pytest.mark.filterwarnings("ignore:.*")
+@pytest.mark.parametrize("suffix", ["vtu", "vtk", "msh", "ply"])
+@pytest.mark.parametrize("name", ["x", "POINTS", "CELL_TYPES", "METADATA", "NodeData", "end_header"])
+def test_names_with_a_meaning_in_a_format_are_read_back_or_refused(tmp_path, suffix, name):
+    mesh, values = hj.SurfaceMesh(*octahedron()), np.arange(6.0)
+    if (suffix, name) in [("ply", "x"), ("ply", "end_header"), ("vtk", "METADATA")]:
+        with pytest.raises(ValueError, match=rf"name: got '{name}', which has another meaning in \.{suffix}"):
+            save(tmp_path / f"m.{suffix}", values, mesh, name=name)
+    else:
+        arrays = read_mesh_arrays(save(tmp_path / f"m.{suffix}", values, mesh, name=name))
+        np.testing.assert_array_equal(arrays[name], values)
+
+
 def test_cleaned_tetrahedra_and_their_arrays(tmp_path, rng):
     """Split into corners, some in the other order, with a flat one and a vertex without any: as at first."""
     corners, cells = np.asarray(SOLID.vertices)[SOLID.cells].reshape(-1, 3), np.arange(640).reshape(-1, 4)

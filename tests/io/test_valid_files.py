@@ -195,11 +195,11 @@ def test_tensors_at_cells(tmp_path, suffix, capsys):
     boundary = ("triangle", cells[:5, :3])  # as many codes write it beside the solid
     data = {"D": [np.zeros((5, 9)), tensors.reshape(-1, 9)]}
     path = tmp_path / f"m.{suffix}"
+    mesh = meshio.Mesh(x, [boundary, ("tetra", cells)], cell_data=data)
     if suffix == "msh":
-        mesh = meshio.Mesh(x, [("tetra", cells)], cell_data={"D": data["D"][1:]})
         meshio.gmsh.write(str(path), mesh, "2.2", binary=True)
     else:
-        meshio.Mesh(x, [boundary, ("tetra", cells)], cell_data=data).write(path)
+        mesh.write(path)
     found = hj.io.read_mesh_arrays(path, at="cells")["D"].reshape(-1, 3, 3)
     np.testing.assert_array_equal(found, tensors)
     with pytest.raises(ValueError, match=r"at: got 'faces', but the places of arrays in .* are vertices, cells"):
@@ -216,14 +216,91 @@ def test_tensors_at_cells(tmp_path, suffix, capsys):
         np.testing.assert_allclose(result["hks"], hj.hks(hj.eigenpairs(mesh, 5), [0.3]), rtol=1e-6)
 
 
-def test_a_gmsh_file_whose_arrays_at_cells_meshio_cannot_read_is_read_without_them(tmp_path):
-    meshio = pytest.importorskip("meshio")
-    points = SQUARE[[0, 1, 2, 4, 5]]
-    cells = [("triangle", np.array([[0, 1, 2]])), ("quad", np.array([[1, 3, 4, 2]]))]
-    mesh = meshio.Mesh(points, cells, cell_data={"a": [[1.0], [2.0]]})
-    meshio.gmsh.write(str(tmp_path / "m.msh"), mesh, "2.2", binary=True)
-    with pytest.warns(UserWarning, match=r"arrays at the cells \(\$ElementData\) are not read"):
-        assert len(hj.io.read_mesh(tmp_path / "m.msh").faces) == 3
+def gmsh_file(version, text, nodes, elements, sections):
+    """Return a Gmsh file of nodes {tag: place}, elements [(type, tag, tags of nodes)] and arrays {tag: values}."""
+
+    def put(kind, *numbers):  # "i": a tag or an integer, "u": a size, "d": a real number
+        if text:
+            return " ".join(map(str, numbers)).encode() + b"\n"
+        return np.array(numbers, {"i": "<i4", "u": "<u8", "d": "<f8"}[kind]).tobytes()
+
+    def line(*words):
+        return (" ".join(map(str, words)) + "\n").encode()
+
+    out = line("$MeshFormat") + line(version, int(not text), 8)
+    out += b"" if text else np.array(1, "<i4").tobytes() + b"\n"
+    out += line("$EndMeshFormat") + line("$Nodes")
+    if version == "2.2":
+        out += line(len(nodes))
+        out += b"".join(put("i", tag).replace(b"\n", b" " * text) + put("d", *place) for tag, place in nodes.items())
+        out += line("$EndNodes") + line("$Elements") + line(len(elements))
+        for kind, tag, corners in elements:
+            out += put("i", tag, kind, 2, 7, 7, *corners) if text else put("i", kind, 1, 2, tag, 7, 7, *corners)
+    else:
+        half = len(nodes) // 2  # two blocks
+        blocks = [dict(list(nodes.items())[:half]), dict(list(nodes.items())[half:])]
+        out += put("u", 2, len(nodes), min(nodes), max(nodes))
+        for block in blocks:
+            out += put("i", 2, 1, 0, len(block)) if text else put("i", 2, 1, 0) + put("u", len(block))
+            out += b"".join(put("u", tag) for tag in block) + b"".join(put("d", *place) for place in block.values())
+        tags = [tag for _, tag, _ in elements]
+        out += line("$EndNodes") + line("$Elements") + put("u", len(elements), len(elements), min(tags), max(tags))
+        for kind, tag, corners in elements:
+            out += (put("i", 2, 1, kind, 1) if text else put("i", 2, 1, kind) + put("u", 1)) + put("u", tag, *corners)
+    out += line("$EndElements")
+    for kind, name, step, values in sections:
+        size = len(next(iter(values.values())))
+        out += line(f"${kind}") + line(1) + line(f'"{name}"') + line(1) + line(0.5) + line(3)
+        out += line(step) + line(size) + line(len(values))
+        out += b"".join(put("i", tag).replace(b"\n", b" " * text) + put("d", *row) for tag, row in values.items())
+        out += line(f"$End{kind}")
+    return out
+
+
+@pytest.mark.parametrize("version", ["2.2", "4.1"])
+@pytest.mark.parametrize("text", [True, False])
+def test_arrays_of_gmsh_are_placed_by_tags(tmp_path, version, text):
+    """Of lines, triangles and quadrilaterals; at all nodes and elements or at some, in another order, in steps."""
+    pytest.importorskip("meshio")
+    tags = [11, 3, 7, 1, 5, 2] if text or version == "4.1" else [1, 2, 3, 4, 5, 6]  # meshio reads no others there
+    nodes = dict(zip(tags, SQUARE.tolist(), strict=True))
+    elements = [(1, 30, tags[:2]), (3, 4, tags[:4]), (2, 9, [tags[i] for i in (1, 4, 2)])]
+    elements += [(2, 8, [tags[i] for i in (4, 5, 2)])]
+    tensors = {tag: (tag * np.eye(3)).ravel() for tag in (4, 8, 9, 30)}
+    x = {tag: [nodes[tag][0]] for tag in sorted(nodes)}
+    sections = [
+        ("NodeData", "x", 0, x),
+        ("NodeData", "x", 1, {tag: [10 + value[0]] for tag, value in x.items()}),
+        ("ElementData", "D", 0, tensors),
+        ("ElementData", "some", 0, {9: [0.9]}),
+        ("ElementData", "some", 0, {4: [0.4]}),  # as of another partition
+        ("ElementData", "of lines", 0, {30: [1.0]}),
+    ]
+    path = tmp_path / "m.msh"
+    path.write_bytes(gmsh_file(version, text, nodes, elements, sections))
+    mesh, at_nodes = hj.io.read_mesh(path), hj.io.read_mesh_arrays(path)
+    np.testing.assert_array_equal(mesh.vertices, SQUARE)
+    np.testing.assert_array_equal(mesh.faces, [[0, 1, 2], [0, 2, 3], [1, 4, 2], [4, 5, 2]])
+    assert set(at_nodes) == {"x", "x, step 1"}
+    np.testing.assert_array_equal(at_nodes["x"], SQUARE[:, 0])
+    np.testing.assert_array_equal(at_nodes["x, step 1"], 10 + SQUARE[:, 0])
+    at_faces = hj.io.read_mesh_arrays(path, at="faces")
+    assert set(at_faces) == {"D", "some"}
+    np.testing.assert_array_equal(at_faces["D"].reshape(-1, 3, 3), np.array([4, 4, 9, 8])[:, None, None] * np.eye(3))
+    np.testing.assert_array_equal(at_faces["some"], [0.4, 0.4, 0.9, np.nan])
+    whole = path.read_bytes()
+    for end in (whole.rfind(b"$End"), whole.rfind(b"$ElementData") + 40):
+        path.write_bytes(whole[:end])
+        with pytest.raises(ValueError, match=r"the file has no complete section \$ElementData"):
+            hj.io.read_mesh(path)
+    others = [(5, 40, [*tags[:4], *tags[:4]])]
+    path.write_bytes(gmsh_file(version, text, nodes, [*elements, *others], sections))
+    with pytest.raises(ValueError, match=r"m\.msh: got hexahedron cells; expected triangles"):
+        hj.io.read_mesh(path)
+    stray = [("ElementData", "D", 0, {**tensors, 77: np.zeros(9)})]
+    path.write_bytes(gmsh_file(version, text, nodes, elements, stray))
+    with pytest.raises(ValueError, match=r"\$ElementData has a value at 77, which is not in the file"):
+        hj.io.read_mesh(path)
 
 
 def test_tensors_at_faces_follow_quadrilaterals_and_cleaning(tmp_path):
@@ -232,6 +309,26 @@ def test_tensors_at_faces_follow_quadrilaterals_and_cleaning(tmp_path):
     meshio.Mesh(SQUARE, cells, cell_data={"a": [[1.0], [2.0, 3.0, 4.0]]}).write(tmp_path / "m.vtu")
     arrays = hj.io.read_mesh_arrays(tmp_path / "m.vtu", at="faces", clean=True)
     np.testing.assert_array_equal(arrays["a"], [1, 1, 2, 4])
+
+
+def test_tensors_at_the_cells_of_polygonal_data(tmp_path, capsys):
+    """Beside points, lines and a strip, whose cells are numbered before and after the polygons."""
+    pytest.importorskip("vtkmodules", reason='VTK is not installed: pip install "hks-jax[vtk]"')
+    points = np.vstack([SQUARE, [[3, 0, 0], [3, 1, 0]]])
+    lists = {"VERTICES": [[0], [1]], "LINES": [[0, 1]], "POLYGONS": [[0, 1, 2, 3], [1, 4, 5], [1, 5, 2]]}
+    lists["TRIANGLE_STRIPS"] = [[4, 6, 5, 7]]
+    text = "# vtk DataFile Version 3.0\ntest\nASCII\nDATASET POLYDATA\nPOINTS 8 double\n"
+    text += "\n".join(" ".join(map(str, point)) for point in points) + "\n"
+    for name, cells in lists.items():
+        text += f"{name} {len(cells)} {sum(len(cell) + 1 for cell in cells)}\n"
+        text += "".join(f"{len(cell)} {' '.join(map(str, cell))}\n" for cell in cells)
+    text += "CELL_DATA 7\nFIELD a 1\nD 9 7 double\n"
+    text += "\n".join(" ".join(map(str, (i + 1) * np.eye(3).ravel())) for i in range(7)) + "\n"
+    (tmp_path / "m.vtk").write_text(text)
+    found = hj.io.read_mesh_arrays(tmp_path / "m.vtk", at="faces")["D"].reshape(-1, 3, 3)
+    np.testing.assert_array_equal(found, np.array([4, 4, 5, 6, 7, 7])[:, None, None] * np.eye(3))
+    assert main(["info", str(tmp_path / "m.vtk")]) == 0
+    assert "D at the faces, components: 9" in capsys.readouterr().out
 
 
 def test_six_components_in_legacy_vtk(tmp_path):

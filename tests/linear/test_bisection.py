@@ -13,7 +13,7 @@ from hks_jax.linear.bisection import bisect_graph, minimum_cover
 from hks_jax.linear.dissection import dissect
 from hks_jax.linear.multifrontal import factorise, try_out
 from hks_jax.linear.operators import DiagonalOperator
-from hks_jax.linear.pencil import SymmetricPencil, tabulated
+from hks_jax.linear.symmetric_pencil import SymmetricPencil, tabulated
 
 
 def random_graph(rng: np.random.Generator, n: int, edges: float) -> sp.csr_matrix:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hks_jax as hj
-from hks_jax.eigen.adjoints.adjoint import amplification, projected
+from hks_jax.eigen.adjoints.complement import amplification, projected
 from hks_jax.eigen.adjoints.factorised_adjoint import FactorisedAdjoint
 from hks_jax.eigen.shift_invert.host_adjoint import _solve as solve_on_host
 from hks_jax.linear.conjugate_gradients import conjugate_gradients

@@ -14,7 +14,7 @@ from test_orientation import RAS, SHAPE, STORAGES, stored
 import hks_jax as hj
 from hks_jax.cli import main
 from hks_jax.io import Result, TensorVolume
-from hks_jax.plot import Orientation, ellipses, explore, new_figure, scalar_image, signature_panels, surface
+from hks_jax.plot import Orientation, ellipses, explore, hks_curves, new_figure, scalar_image, signature_panels, surface
 from hks_jax.plot.images import colours_of
 
 TIMES = np.array([1e3, 4e3])
@@ -132,6 +132,50 @@ def test_hatching_covers_the_marked_nodes_and_can_be_left_out():
     mesh = hj.examples.sphere_mesh(2)
     with unchecked(), pytest.raises(ValueError, match=r"hatched: got shape \(3,\)"):
         surface(new_figure(3, 3).add_subplot(projection="3d"), mesh, mesh.vertices[:, 2], hatched=np.ones(3, bool))
+
+
+def test_curves_are_pale_where_the_boundary_acts(tmp_path, monkeypatch):
+    """From Python and on the command line, on a slice that is stored right to left, at some of the saved times."""
+    grid, times = hj.Grid((4, 3)), np.array([1.0, 2.0, 3.0])
+    values = np.arange(1.0, 37).reshape(3, 4, 3)
+    near = np.zeros((3, 4, 3), bool)
+    near[1:, 0, 0] = True
+    ax = new_figure(3, 3).add_subplot()
+    touched, free = hks_curves(ax, values, times, grid, [[0, 0], [3, 2]], near_rim=near)
+    np.testing.assert_array_equal(touched.get_ydata(), [1, np.nan, np.nan])
+    np.testing.assert_array_equal(free.get_ydata(), values[:, 3, 2])
+    (pale,) = (line for line in ax.lines if (line.get_alpha() or 1) < 1)
+    np.testing.assert_array_equal(pale.get_ydata(), values[:, 0, 0])
+    assert pale.get_color() is touched.get_color()
+    texts = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert texts == ["(0, 0)", "(3, 2)", "pale: the boundary contributes over 10 %"]
+    with unchecked(), pytest.raises(ValueError, match=r"near_rim: got shape \(4, 3\) .*; expected .* \(3, 4, 3\)"):
+        hks_curves(ax, values, times, grid, [[0, 0]], near_rim=near[0])
+
+    found = []
+    monkeypatch.setattr("hks_jax.plot.hks_curves", lambda *given, **style: found.append(hks_curves(*given, **style)))
+    result = result_of((0, 1, 2), (True, False, False), axis=2)  # near the boundary where x is largest
+    result.save(tmp_path / "hks", "")
+    x, y = result.volume.affine[:2, 3]
+    command = ["plot", str(tmp_path / "hks.npz"), "-o", str(tmp_path / "p.png"), "-q", "--times", "4e3"]
+    for more, share in ([], 0.5), (["--show-rim"], 0):
+        assert main([*command, "--points", f"{x},{y}", f"{x - 8},{y}", *more]) == 0
+        assert np.mean([np.isnan(line.get_ydata()) for line in found.pop()]) == share
+
+
+@pytest.mark.skipif(find_browser() is None, reason="no Chromium")
+@pytest.mark.slow
+def test_curves_are_pale_in_a_browser(tmp_path):
+    pale = "[...document.querySelectorAll('#chart path')].filter((one) => one.getAttribute('opacity') < 1).length"
+    with Browser(tmp_path) as browser:
+        browser.open(explore(result_of((0, 1, 2), (False,) * 3, axis=2), tmp_path / "page.html"))
+        for across, count in (0.9, 0), (0.05, 1):
+            browser.click("#signature", across, 0.5)
+            assert browser.run(pale) == count
+            assert ("pale: the boundary contributes over 10 %" in browser.text("#legend")) == bool(count)
+        browser.click("#rim", 0.5, 0.5)
+        assert browser.run(pale) == 0
+        assert browser.problems == []
 
 
 def test_stripes_cover_the_marked_part_of_a_surface(monkeypatch):

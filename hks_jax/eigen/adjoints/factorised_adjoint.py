@@ -1,6 +1,6 @@
 """Linear solves with K − λᵢM on the complement of computed eigenvectors, all in JAX.
 
-The method is described in `hks_jax.eigen.adjoints.adjoint`: conjugate gradients with a factorisation of K − σM as
+The method is described in `hks_jax.eigen.adjoints.complement`: conjugate gradients with a factorisation of K − σM as
 preconditioner for each group of neighbouring eigenvalues. Eigenvalues are grouped by index instead of value, so that
 array shapes are static. By Weyl's law, eigenvalues are distributed so regularly that groups by index suffice. All
 products with the Jacobian at one point share the factorisations of K − σM.
@@ -16,13 +16,13 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from hks_jax.compilation import is_concrete_on_cpu, jit_quickly
-from hks_jax.eigen.adjoints import adjoint as complement
-from hks_jax.eigen.adjoints.adjoint import Adjoint, Columns, OfRows, Rows, Shifts, Values, Vectors
+from hks_jax.eigen.adjoints import complement
+from hks_jax.eigen.adjoints.complement import Adjoint, Columns, OfRows, Rows, Shifts, Values, Vectors
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
 from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.multifrontal import Factorisation, factorise
-from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import matmul, products_with_columns
+from hks_jax.linear.symmetric_pencil import SymmetricPencil
 
 BLOCK = 16
 """The number of right-hand sides that conjugate gradients treat at once."""

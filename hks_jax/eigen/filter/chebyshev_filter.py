@@ -12,12 +12,12 @@ from jax.sharding import Mesh, NamedSharding
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.checks import require_count
-from hks_jax.eigen.adjoints.adjoint import Adjoint
+from hks_jax.eigen.adjoints.complement import Adjoint
 from hks_jax.eigen.filter.coarsening import coarsen
 from hks_jax.eigen.filter.filtered_adjoint import FilteredAdjoint
 from hks_jax.eigen.filter.polynomial import upper_end
 from hks_jax.eigen.filter.subspace import EVERYWHERE
-from hks_jax.eigen.filter.subspace_iteration import FilterState, GridFilter, Plan
+from hks_jax.eigen.filter.subspace_iteration import FilterPlan, FilterState, GridFilter
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, Status, silent
 from hks_jax.fem.halo import checked_mesh
@@ -104,15 +104,15 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         """Return the largest k for which the filter still damps most of the spectrum."""
         return max(n_dof // 8 - self.block, 0)
 
-    def plan(self, k: int, space: GridSpace) -> Plan:
+    def plan(self, k: int, space: GridSpace) -> FilterPlan:
         """Return the number of vectors, and the other static settings of the subspace iteration, for k eigenpairs."""
         mesh = None if self.mesh is None else checked_mesh(self.mesh)
         together = self.block if mesh is None else self.block * mesh.size
         size = math.ceil((k + max(8, _SPARE * k)) / together) * together
-        return Plan(k, size, self.block, space.n_null, self.tolerance, mesh)
+        return FilterPlan(k, size, self.block, space.n_null, self.tolerance, mesh)
 
 
-def _lowest(pencil: Pencil, plan: Plan, max_rounds: int, report: Report) -> Pairs:
+def _lowest(pencil: Pencil, plan: FilterPlan, max_rounds: int, report: Report) -> Pairs:
     grids = [_replicated(plan.mesh, GridFilter(nodal, upper_end(nodal), plan)) for nodal in _nested(pencil, plan)]
     grid = grids.pop()
     state, rounds = grid.from_random(pencil.volume), _FIRST_ROUNDS
@@ -189,7 +189,7 @@ class Pace:
         return (rounds - done / self._work) * self._seconds * self._work / self._last_work
 
 
-def _nested(pencil: Pencil, plan: Plan) -> list[NodalPencil]:
+def _nested(pencil: Pencil, plan: FilterPlan) -> list[NodalPencil]:
     """Return the pencils of all grids, from the finest to the coarsest."""
     grids, free = [nodal_pencil(pencil)], pencil.space.free
     while True:

@@ -14,8 +14,8 @@ from jaxtyping import Array
 
 from hks_jax.checks import require_count
 from hks_jax.compilation import jit_quickly
-from hks_jax.eigen.adjoints import adjoint as complement
-from hks_jax.eigen.adjoints.adjoint import Adjoint, Columns, Rows, Scalar, Values, Vectors
+from hks_jax.eigen.adjoints import complement
+from hks_jax.eigen.adjoints.complement import Adjoint, Columns, Rows, Scalar, Values, Vectors
 from hks_jax.eigen.filter.polynomial import Band, correction, upper_end
 from hks_jax.fem.nodal import nodal_pencil, to_columns, to_rows
 from hks_jax.fem.pencil import Pencil

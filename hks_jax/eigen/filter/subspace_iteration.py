@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Int
 
+from hks_jax.arrays import Scalar
 from hks_jax.eigen.filter import subspace
 from hks_jax.eigen.filter.coarsening import interpolate
 from hks_jax.eigen.filter.polynomial import Band, correction
@@ -37,14 +38,13 @@ eigenvalue for all λ above twice that eigenvalue."""
 _MOST_TERMS = 15
 """The maximal number of terms, after the first, of the Neumann series of the inverse mass."""
 
-Scalar = Float[Array, ""]
 Number = Int[Array, ""]
 Values = Float[Array, " m"]
 OwnRows = Float[Array, "own nodes"]
 """The vectors that this device filters, on all nodes of the grid."""
 
 
-class Plan(NamedTuple):
+class FilterPlan(NamedTuple):
     """The static settings of subspace iteration."""
 
     wanted: int  # the number of eigenpairs
@@ -81,7 +81,7 @@ class GridFilter(eqx.Module):
 
     pencil: NodalPencil  # K and M
     high: Scalar  # an upper bound of the spectrum of D⁻¹K, where D is the lumped mass
-    plan: Plan = eqx.field(static=True)
+    plan: FilterPlan = eqx.field(static=True)
 
     @property
     def slabs(self) -> Slabs | None:
@@ -217,7 +217,7 @@ class GridFilter(eqx.Module):
         return self.ritz(subspace.to_slabs(self.slabs, self.plan.block, rows), zero, zero)
 
 
-def _lumping(plan: Plan, state: FilterState) -> tuple[Number, Values, Values]:
+def _lumping(plan: FilterPlan, state: FilterState) -> tuple[Number, Values, Values]:
     """Return the fields ``terms``, ``values`` and ``factor`` of `Filtering`."""
     values, wanted = state.values, state.values[plan.wanted - 1]
     # The lumped mass decreases the eigenvalue of each mode by a relative amount, 1 − β.

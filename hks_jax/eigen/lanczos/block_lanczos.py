@@ -11,14 +11,22 @@ from jaxtyping import Array, Float
 from hks_jax.checks import require_count
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.inertia import Scalar, dissected, locate
-from hks_jax.eigen.lanczos.slicing import cut, search
-from hks_jax.eigen.lanczos.slicing_state import Plan, Problem, SlicingState, Stored, first_state, unfinished
+from hks_jax.eigen.lanczos.slicing import (
+    Problem,
+    SlicingPlan,
+    SlicingState,
+    Stored,
+    cut,
+    first_state,
+    search,
+    unfinished,
+)
 from hks_jax.eigen.quality import indistinct, measure_pairs
 from hks_jax.eigen.solver import FAR, Dense, Eigensolver, RawPairs, Report, silent
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.loops import when, while_loop
-from hks_jax.linear.pencil import SymmetricPencil, tabulated
+from hks_jax.linear.symmetric_pencil import SymmetricPencil, tabulated
 from hks_jax.traced import is_traced
 
 SLICE = 170
@@ -83,7 +91,7 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
             values, vectors, bound = self._by_slices(moved, plan, report)
         return values[:k] + origin, vectors[:k], bound + origin
 
-    def _by_slices(self, problem: Problem, plan: Plan, report: Report) -> RawPairs:
+    def _by_slices(self, problem: Problem, plan: SlicingPlan, report: Report) -> RawPairs:
         k, dissection = plan.wanted, dissected(problem.pencil)
         if not is_traced(problem):
             problem = problem._replace(pencil=tabulated(problem.pencil))
@@ -107,16 +115,16 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
         """Return the largest k that leaves room for a Lanczos basis."""
         return max((n_dof - 16 * self.block) // 4, 0)
 
-    def plan(self, k: int, nulls: int = 0) -> Plan:
+    def plan(self, k: int, nulls: int = 0) -> SlicingPlan:
         """Return the slice size and other static settings for k eigenvalues; the first ``nulls`` are zero."""
         slices = max(round(k / (self.slice_size or SLICE)), 1)
         size = math.ceil(1.06 * k / slices) + 2
         # The search divides residuals by an estimate of the mean gap, the result by the mean gap of the pairs found.
-        return Plan(k, self.block, size, 3 * slices + 12, self.tolerance / 4, nulls)
+        return SlicingPlan(k, self.block, size, 3 * slices + 12, self.tolerance / 4, nulls)
 
 
 @jit_quickly(static_argnames="plan")
-def expected(pencil: Pencil, plan: Plan) -> Problem:
+def expected(pencil: Pencil, plan: SlicingPlan) -> Problem:
     """Return the pencil with estimates of its spectrum from Weyl's law."""
     assert pencil.volume is not None
     n, dtype = pencil.space.dimension, pencil.stiffness.dtype

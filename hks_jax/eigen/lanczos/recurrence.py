@@ -13,8 +13,8 @@ from hks_jax.eigen.lanczos import krylov_basis
 from hks_jax.eigen.lanczos.krylov_basis import Basis, Block, Small, orthonormal
 from hks_jax.linear import accelerators, lapack
 from hks_jax.linear.multifrontal import Factorisation
-from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import matmul, products_with_columns
+from hks_jax.linear.symmetric_pencil import SymmetricPencil
 from hks_jax.traced import is_traced
 
 _STRETCH = 16

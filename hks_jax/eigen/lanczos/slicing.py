@@ -7,21 +7,23 @@ factorisation, at a shift above the wanted eigenvalues, is the certificate: its 
 eigenvalues below the shift. Small slices keep orthogonalisation cheap for any number of wanted pairs.
 """
 
+from typing import Any, NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from hks_jax.arrays import Scalar
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.lanczos.krylov_basis import Block, orthonormal
 from hks_jax.eigen.lanczos.recurrence import RitzPairs, ShiftedSolve, block_lanczos
-from hks_jax.eigen.lanczos.slicing_state import Plan, Problem, SlicingState, Stored, crowded, make_room
 from hks_jax.eigen.quality import allowed_residuals, indistinct, measure_pairs
 from hks_jax.linear import lapack
 from hks_jax.linear.dissection import Dissection
-from hks_jax.linear.loops import when
+from hks_jax.linear.loops import by_column_ranges, when
 from hks_jax.linear.multifrontal import Factorisation, Trial, factorise, try_out
-from hks_jax.linear.pencil import SymmetricPencil
 from hks_jax.linear.products import gram, matmul, products_with_columns
+from hks_jax.linear.symmetric_pencil import SymmetricPencil
 from hks_jax.traced import is_traced
 
 _ERROR = 0.1
@@ -34,15 +36,161 @@ _TURNS = 12
 """The maximal number of inverse iterations in a search."""
 _COPY = 1e-6
 """The relative distance within which all computed copies of a multiple eigenvalue lie."""
+_NODES = 1 << 16
+"""The number of degrees of freedom for which the stored eigenvectors are reordered at once."""
 
-Scalar = Float[Array, ""]
+Stored = Float[Array, "capacity n_dof"]
 Interval = tuple[Scalar, Scalar]
 Order = Int[Array, " ritz"]
 """The order in which Ritz vectors are stored; accepted vectors come first."""
 
 
+class Problem(NamedTuple):
+    """A pencil, and estimates of its spectrum. No eigenvalue is negative."""
+
+    pencil: SymmetricPencil  # K and M
+    first: Float[Array, ""]  # the first shift
+    spacing: Float[Array, ""]  # the expected mean gap of eigenvalues
+    lowest: Float[Array, ""]  # the expected lowest nonzero eigenvalue
+    unit: Float[Array, ""]  # the least number by which residuals are divided in relative residuals
+
+
+class SlicingPlan(NamedTuple):
+    """The static settings of spectrum slicing."""
+
+    wanted: int  # the number of eigenpairs
+    block: int  # the number of vectors per Lanczos block
+    slice_size: int  # the expected number of eigenvalues per slice, half of them below its shift
+    max_slices: int  # the maximal number of factorisations
+    tolerance: float  # the relative residual at which a pair counts as converged
+    nulls: int  # the number of wanted eigenvalues that are known to be zero
+
+    @property
+    def steps(self) -> int:
+        """The maximal number of Lanczos blocks in a slice."""
+        return self.steps_for(self.slice_size)
+
+    def steps_for(self, size: Any) -> Any:
+        """Return the number of Lanczos blocks, rounded up to even, for ``size`` eigenvalues to converge."""
+        # In measurements, m Lanczos vectors in blocks of b gave about (m − 12 b)/2.1 pairs with residuals below 1e-8.
+        return 2 * -(-(21 * size + 120 * self.block) // (20 * self.block))
+
+    @property
+    def ritz(self) -> int:
+        """The number of Ritz pairs examined in each slice, a multiple of the block size."""
+        return min(self.steps, -(-self.slice_size * 6 // 5 // self.block)) * self.block
+
+    @property
+    def window(self) -> int:
+        """The number of known eigenvectors to which a slice stays orthogonal, so that it does not find them again.
+        Eigenvectors far from the shift may be omitted, because Lanczos finds the near ones first.
+        """
+        size = max(self.slice_size // 4, min(self.slice_size // 2, 48))
+        return -(-size // self.block) * self.block
+
+    @property
+    def capacity(self) -> int:
+        """The maximal number of stored eigenpairs."""
+        return self.wanted + self.block + self.ritz
+
+
+# A slice begins with the factorisation of K − σM at a shift σ. Its negative pivots give the number ``below`` of
+# eigenvalues below σ, unless a trial solve shows that the inertia is uncertain. Let ``missing`` be the number of
+# eigenvalues below σ that are not known, and m the slice size. The first line that applies decides (`_consider`):
+#
+#     inertia at σ                                        next
+#     --------------------------------------------------  -------------------------------------------------------------
+#     certain, missing = 0, all wanted pairs are known    finished: the inertia is the certificate
+#     certain, missing > m, and a lower σ separates them  a lower σ (`far` remembers this one)
+#     certain, missing > 2 blocks, and a lower σ did not  copies of one eigenvalue (`multiple`): if enough are known,
+#                                                         σ just below them; otherwise a search by inverse iteration
+#     certain, but solves are too inaccurate (once)       σ beside
+#     uncertain (three times)                             σ beside
+#     otherwise                                           a search by block Lanczos, with refined solves if inaccurate
+#
+# A search accepts converged pairs, unless an unknown pair may lie between them and σ. The next shift is then
+# (`_accept`):
+#
+#     pairs below σ     accepted   next
+#     ----------------  ---------  ------------------------------------------------------------------------------------
+#     none is missing   some       σ in the next slice or, if all wanted pairs are known, in the widest gap above them
+#     none is missing   none       σ beyond the gap, at the Ritz values above it
+#     some are missing  some       σ towards the lowest Ritz value that did not converge, with refined solves
+#     some are missing  none       `stuck`: as before, or below the spectrum; known pairs above `reached` are discarded
+#                                  (`make_room`), and larger rounding errors are accepted
+class SlicingState(NamedTuple):
+    """The state of spectrum slicing, except eigenvectors. A pair is called known if it was computed and accepted."""
+
+    values: Float[Array, " capacity"]  # known eigenvalues in the order of acceptance, padded with infinity
+    known: Int[Array, ""]  # the number of known pairs
+    shift: Float[Array, ""]  # the next shift
+    # the number of eigenvalues below the shift, by inertia; −1 if the factorisation was too inaccurate
+    below: Int[Array, ""]
+    multiple: Bool[Array, ""]  # whether many copies of one multiple eigenvalue are probably missing
+    far: Float[Array, ""]  # the last shift at which too many eigenvalues were missing for a search
+    far_below: Int[Array, ""]  # the number of eigenvalues below `far`; 0 at first
+    reached: Float[Array, ""]  # the end of the range from zero in which no eigenvalue seems to be missing
+    complete_below: Float[Array, ""]  # inertia certifies that every eigenvalue below this number is known
+    start: Float[Array, "n_dof block"]  # the start block of the next Lanczos run
+    noise: Float[Array, "n_dof block"]  # independent normal random numbers
+    slices: Int[Array, ""]  # the number of factorisations so far
+    moved: Int[Array, ""]  # the number of consecutive moves of the shift because of inaccurate factorisations
+    passes: Int[Array, ""]  # the number of solves per step: 1, or 2 with a refinement step
+    stuck: Bool[Array, ""]  # whether the last search found none of the missing pairs
+    finished: Bool[Array, ""]  # whether all wanted pairs are known and certified
+
+
+@jit_quickly(static_argnames="plan")
+def first_state(problem: Problem, plan: SlicingPlan) -> tuple[SlicingState, Stored]:
+    """Return the initial state, without known pairs, and storage for eigenvectors."""
+    n, dtype = problem.pencil.size, problem.pencil.stiffness.dtype
+    noise = jax.random.normal(jax.random.key(0), (n, plan.block), dtype)
+    state = SlicingState(
+        values=jnp.full(plan.capacity, jnp.inf, dtype),
+        known=jnp.zeros((), int),
+        shift=problem.first,
+        below=jnp.full((), -1, int),
+        multiple=jnp.zeros((), bool),
+        far=jnp.zeros((), dtype),
+        far_below=jnp.zeros((), int),
+        reached=jnp.zeros((), dtype),
+        complete_below=jnp.zeros((), dtype),
+        start=noise,
+        noise=noise,
+        slices=jnp.zeros((), int),
+        moved=jnp.zeros((), int),
+        passes=jnp.ones((), int),
+        stuck=jnp.zeros((), bool),
+        finished=jnp.zeros((), bool),
+    )
+    return state, jnp.zeros((plan.capacity, n), dtype)
+
+
+@jit_quickly(static_argnames="plan")
+def unfinished(plan: SlicingPlan, state: SlicingState) -> Bool[Array, ""]:
+    """Return whether another slice is needed and allowed."""
+    return ~state.finished & (state.slices < plan.max_slices)
+
+
+def crowded(plan: SlicingPlan, state: SlicingState) -> Bool[Array, ""]:
+    """Return whether to discard some known pairs, because the storage is full or the search is stuck."""
+    return state.stuck | (state.known > plan.capacity - plan.ritz)
+
+
+@jit_quickly(static_argnames="plan", donate_argnames="vectors")
+def make_room(plan: SlicingPlan, state: SlicingState, vectors: Stored) -> tuple[SlicingState, Stored]:
+    """Discard the highest known pairs to make room for a search; if stuck, discard all pairs above ``reached``."""
+    order = jnp.argsort(state.values)
+    count = jnp.where(state.stuck, jnp.sum(state.values <= state.reached), state.known)
+    count = jnp.minimum(count, plan.capacity - plan.ritz)
+    kept = jnp.arange(plan.capacity) < count
+    values = jnp.where(kept, state.values[order], jnp.inf)
+    vectors = by_column_ranges(lambda part: jnp.where(kept[:, None], part[order], 0), _NODES, vectors)
+    return state._replace(values=values, known=count), vectors
+
+
 def cut(
-    problem: Problem, dissection: Dissection, plan: Plan, state: SlicingState, vectors: Stored
+    problem: Problem, dissection: Dissection, plan: SlicingPlan, state: SlicingState, vectors: Stored
 ) -> tuple[Factorisation, Bool[Array, ""], tuple[SlicingState, Stored]]:
     """Factorise K − σM at the next shift σ; also return whether to search around σ, and the state with free storage."""
     factor = factorise(dissection, problem.pencil.shifted(state.shift))
@@ -53,7 +201,7 @@ def cut(
 
 @jit_quickly(static_argnames="plan")
 def _consider(
-    problem: Problem, below: Int[Array, ""], trial: Trial, plan: Plan, state: SlicingState
+    problem: Problem, below: Int[Array, ""], trial: Trial, plan: SlicingPlan, state: SlicingState
 ) -> tuple[Bool[Array, ""], Bool[Array, ""], SlicingState]:
     """Decide whether to search at the current shift, and whether to free storage first; also return the new state."""
     known = jnp.sum(state.values < state.shift)
@@ -99,14 +247,14 @@ def _consider(
     return searchable, searchable & crowded(plan, state), state
 
 
-def _needed(problem: Problem, plan: Plan, lowest: Scalar, excuse: Scalar | float = 1.0) -> Scalar:
+def _needed(problem: Problem, plan: SlicingPlan, lowest: Scalar, excuse: Scalar | float = 1.0) -> Scalar:
     """Return the largest residual ‖Kφ − λMφ‖/‖Mφ‖ at which the lowest missing eigenvalue counts as converged."""
     rounding = excuse * indistinct(problem.pencil, lowest.dtype)
     return allowed_residuals(jnp.maximum(lowest, problem.unit), rounding, plan.tolerance)
 
 
 def search(
-    problem: Problem, factor: Factorisation, plan: Plan, both: tuple[SlicingState, Stored]
+    problem: Problem, factor: Factorisation, plan: SlicingPlan, both: tuple[SlicingState, Stored]
 ) -> tuple[SlicingState, Stored]:
     """Find the eigenpairs around the shift."""
     state, vectors = both
@@ -130,7 +278,7 @@ def search(
 # more steps than there are distinct eigenvalues. Inverse iteration with m vectors finds m pairs near the shift. If the
 # multiplicity of an eigenvalue exceeds m, any m vectors of its eigenspace suffice.
 def _nearest(
-    problem: Problem, shifted: ShiftedSolve, plan: Plan, state: SlicingState, vectors: Stored
+    problem: Problem, shifted: ShiftedSolve, plan: SlicingPlan, state: SlicingState, vectors: Stored
 ) -> tuple[Order, Float[Array, "ritz n_dof"], SlicingState]:
     """Search by inverse iteration, orthogonal to all known eigenvectors; see `_accept`. Values must be concrete."""
     missing = int(state.below - jnp.sum(state.values < state.shift))
@@ -165,7 +313,7 @@ def _inverse_iteration(
 
 @jit_quickly(static_argnames=("plan", "rows"))
 def _window(
-    problem: Problem, plan: Plan, state: SlicingState, vectors: Stored, rows: int
+    problem: Problem, plan: SlicingPlan, state: SlicingState, vectors: Stored, rows: int
 ) -> tuple[Float[Array, "rows n_dof"], Interval, Int[Array, ""]]:
     """Return the known eigenvectors, the interval and the number of Lanczos blocks for a search around the shift.
 
@@ -190,7 +338,7 @@ def _stored(known_vectors: Stored, vectors: Float[Array, "ritz n_dof"], order: O
 
 @jit_quickly(static_argnames="plan")
 def _accept(
-    problem: Problem, plan: Plan, ritz: RitzPairs, interval: Interval, state: SlicingState
+    problem: Problem, plan: SlicingPlan, ritz: RitzPairs, interval: Interval, state: SlicingState
 ) -> tuple[Order, SlicingState]:
     """Accept the converged Ritz pairs in the interval, and choose the next shift.
 
@@ -259,7 +407,7 @@ def _accept(
     return order, state._replace(shift=jnp.where(complete, following, again))
 
 
-def _spacing(problem: Problem, plan: Plan, state: SlicingState) -> Scalar:
+def _spacing(problem: Problem, plan: SlicingPlan, state: SlicingState) -> Scalar:
     """Return the mean gap of the last known eigenvalues; if few are known, at least the ``spacing`` of the problem."""
     few = jnp.minimum(state.known, plan.slice_size)
     ordered = jnp.sort(state.values)
@@ -268,7 +416,7 @@ def _spacing(problem: Problem, plan: Plan, state: SlicingState) -> Scalar:
     return jnp.where(few < plan.block, jnp.fmax(mean, problem.spacing), mean)
 
 
-def _next_shift(problem: Problem, plan: Plan, state: SlicingState) -> Scalar:
+def _next_shift(problem: Problem, plan: SlicingPlan, state: SlicingState) -> Scalar:
     """Return the next shift: within the next slice, or in a gap above the last wanted eigenvalue."""
     ordered, known = jnp.sort(state.values), state.known
     index = jnp.arange(plan.capacity)

@@ -1,6 +1,6 @@
 """Linear solves with K − λᵢM on the complement of computed eigenvectors, on the host.
 
-The method is described in `hks_jax.eigen.adjoints.adjoint`; the preconditioners are SciPy's factorisations.
+The method is described in `hks_jax.eigen.adjoints.complement`; the preconditioners are SciPy's factorisations.
 """
 
 import os
@@ -15,8 +15,8 @@ from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import SuperLU
 from threadpoolctl import threadpool_limits
 
-from hks_jax.eigen.adjoints import adjoint as complement
-from hks_jax.eigen.adjoints.adjoint import Adjoint, Rows, Values, Vectors
+from hks_jax.eigen.adjoints import complement
+from hks_jax.eigen.adjoints.complement import Adjoint, Rows, Values, Vectors
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
 from hks_jax.linear.host_matrices import factorise_stably_on_host, host_matrices

@@ -13,7 +13,7 @@ from scipy.sparse.linalg import ArpackError, ArpackNoConvergence, LinearOperator
 from threadpoolctl import threadpool_limits
 
 from hks_jax.checks import require_count
-from hks_jax.eigen.adjoints.adjoint import Adjoint
+from hks_jax.eigen.adjoints.complement import Adjoint
 from hks_jax.eigen.quality import largest_of
 from hks_jax.eigen.shift_invert.host_adjoint import HostAdjoint
 from hks_jax.eigen.solver import FAR, Eigensolver, RawPairs, Report, Status, silent

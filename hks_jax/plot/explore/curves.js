@@ -32,6 +32,17 @@ function ticksOfNumbers(low, high, most) {
   return found;
 }
 
+const PALE = 0.35;
+
+// The path along those segments, from the point t to the point t + 1, for which chosen(t) holds.
+function strokes(points, chosen) {
+  let d = "";
+  for (let t = 0; t + 1 < points.length; t++) {
+    if (chosen(t)) d += `${t && chosen(t - 1) ? "" : `M${points[t]}`}L${points[t + 1]}`;
+  }
+  return d;
+}
+
 class Chart {
   constructor(svg, legend, choose) {
     this.svg = svg;
@@ -54,7 +65,8 @@ class Chart {
     return first === last ? 0.5 : Math.log(time / first) / Math.log(last / first);
   }
 
-  // A series is {name, colour, line, low, high, thin}, with `line` and the bounds of a band at each time.
+  // A series is {name, colour, line, low, high, thin, pale}, with `line`, the bounds of a band, and `pale` (whether the
+  // boundary contributes over a tenth) at each time.
   draw(series, { quantity, now, from, to }) {
     const width = this.svg.clientWidth || 500;
     const height = this.svg.clientHeight || 320;
@@ -96,20 +108,26 @@ class Chart {
     }
     for (const one of series) {
       const drawn = `fill: none; stroke: var(${one.colour}); stroke-width: ${one.thin ? 1.6 : 2.4}; stroke-linejoin: round; stroke-dasharray: ${one.dashes ?? "none"}`;
-      parts.push(shapeOf("polyline", { points: path(one.line).join(" "), style: drawn, "data-name": one.name }));
+      for (const faint of [false, true]) {
+        const d = strokes(path(one.line), (t) => Boolean(one.pale?.[t] || one.pale?.[t + 1]) === faint);
+        if (d) parts.push(shapeOf("path", { d, style: drawn, opacity: faint ? PALE : 1, "data-name": one.name }));
+      }
       const dot = `fill: var(${one.colour})`;
       parts.push(shapeOf("circle", { cx: this.x(now), cy: y(one.line[now]), r: 3.5, style: dot }));
     }
     parts.push(shapeOf("line", { class: "now", x1: this.x(now), x2: this.x(now), y1: this.top, y2: this.bottom }));
     this.svg.replaceChildren(...parts);
     this.svg.setAttribute("aria-label", `${quantity.long} over t: ${series.map((one) => one.name).join(", ")}`);
-    this.legend.replaceChildren(...series.map((one) => this.entry(one)));
+    const faint = series.some((one) => one.pale?.includes(true));
+    const note = { name: "pale: the boundary contributes over 10 %", colour: "--mean", opacity: PALE };
+    this.legend.replaceChildren(...[...series, ...(faint ? [note] : [])].map((one) => this.entry(one)));
   }
 
   entry(one) {
     const item = document.createElement("li");
     const mark = document.createElement("i");
     mark.style.borderTop = `0.2rem ${one.dashes ? "dashed" : "solid"} var(${one.colour})`;
+    mark.style.opacity = one.opacity ?? 1;
     item.append(mark, one.note ? `${one.name} (${one.note})` : one.name);
     return item;
   }

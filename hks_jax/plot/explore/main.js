@@ -185,7 +185,9 @@ function seriesShown() {
     const line = curve(nodeAt(place), quantity);
     const noise = deviations ? band(line, curve(nodeAt(place), quantity, deviations)) : {};
     const note = `${NODE} ${voxel(place).join(", ")}${deviations ? "; ± noise" : ""}`;
-    shown.push({ name, note, colour: `--${name.toLowerCase()}`, dashes: name === "B" ? "8 4" : null, line, ...noise });
+    const dashes = name === "B" ? "8 4" : null;
+    const pale = times.map((_, t) => hatchedAt(t)?.(nodeAt(place)) ?? false);
+    shown.push({ name, note, colour: `--${name.toLowerCase()}`, dashes, line, pale, ...noise });
   }
   return shown;
 }

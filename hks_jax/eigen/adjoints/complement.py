@@ -20,8 +20,8 @@ from jaxtyping import Float, Int
 
 from hks_jax.checks import require_number
 from hks_jax.linear.operators import OfColumns
-from hks_jax.linear.pencil import P, SymmetricPencil
 from hks_jax.linear.products import even_size, inner_products, matmul, products_with_columns, row_blocks
+from hks_jax.linear.symmetric_pencil import P, SymmetricPencil
 
 Array = Any
 """An array of NumPy or JAX. All arguments of a function and its result are arrays of the same library."""
