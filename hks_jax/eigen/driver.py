@@ -49,9 +49,8 @@ def eigenpairs(
         solver: ``"auto"`` (a choice by size, but never a solver on the host under `jit`, `vmap` or on accelerators),
             ``"dense"``, ``"shift-invert"`` (on the host), ``"block-lanczos"`` (mainly for 2D and surfaces),
             ``"chebyshev-filter"`` (for grids, mainly in 3D), or a solver object such as
-            ``hks_jax.BlockLanczos(tolerance=1e-6)``. The result names the solver in ``.solver_name``. A stiffness that
-            may be indefinite needs ``"dense"`` or ``"block-lanczos"``; with concrete values, ``"shift-invert"`` works
-            too.
+            ``hks_jax.BlockLanczos(tolerance=1e-6)``. The result names the solver in ``.solver_name``. The Chebyshev
+            filter needs a stiffness that is not indefinite.
         mass: the mass matrix of a field or mesh, ``"consistent"`` or ``"lumped"``.
         multiplet: the treatment of a multiple eigenvalue that k cuts, so that only some of its pairs are among the k
             lowest. ``"report"`` warns. ``"drop"`` excludes its pairs from every signature. ``"complete"`` computes 8

@@ -29,6 +29,7 @@ def widened(pencil: AnyPencil, solvers: Sequence[Eigensolver], k: int) -> AnyPen
 
 def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw: bool, report: Report) -> Eigenpairs:
     """Return the k lowest pairs and, if ``extra`` = 1, the next eigenvalue. See `solved` for ``throw``."""
+    solver.require(pencil)
     pencil, n_dof, most = _with_balance(pencil), pencil.size, solver.max_pairs(pencil.size)
     if k + extra > most and pencil.null_space is None:
         solver = Dense(solver.tolerance)

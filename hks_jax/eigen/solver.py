@@ -77,6 +77,9 @@ class Eigensolver(eqx.Module, Generic[P]):
         NaN if there is no certificate. The method works under `jit` and `vmap`; outside `jit`, it may report progress.
         """
 
+    def require(self, pencil: P) -> None:
+        """Raise ValueError unless the method supports the pencil."""
+
     def guards(self, k: int, n_dof: int) -> int:
         """Return the number of pairs beyond k to compute for derivatives."""
         return 8 + k // 50

@@ -154,6 +154,9 @@ def test_potentials_from_every_solver(rng):
         np.testing.assert_allclose(pairs.eigenvalues, exact, rtol=1e-9)
         assert pairs.converged.all()
         assert pairs.complete_below >= pairs.eigenvalues[-1]
+    compiled = eqx.filter_jit(lambda pencil: hj.eigenpairs(pencil, 8, solver="shift-invert"))(moved)
+    np.testing.assert_allclose(compiled.eigenvalues, exact, rtol=1e-9)
+    assert compiled.result == hj.RESULTS.successful
     with pytest.raises(
         ValueError, match="solver: got 'chebyshev-filter', which needs a positive semidefinite stiffness"
     ):

@@ -78,8 +78,8 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         if self.mesh is not None:
             checked_mesh(self.mesh)
 
-    def lowest(self, pencil: Pencil, k: int, report: Report = silent) -> RawPairs:
-        """Return the k lowest eigenpairs; the bound is NaN, because the method has no certificate."""
+    def require(self, pencil: Pencil) -> None:
+        """Raise ValueError unless the pencil is that of a grid, with a known lower bound of the spectrum."""
         if not isinstance(pencil.stiffness, StencilOperator):
             raise ValueError("solver: got 'chebyshev-filter', which needs a grid; use 'shift-invert' for a mesh")
         if not pencil.bounded:
@@ -88,6 +88,9 @@ class ChebyshevFilter(Eigensolver[Pencil]):
                 'space; the null space is unknown. Use "block-lanczos" or "dense", or give `sparse_pencil` the null '
                 "vectors"
             )
+
+    def lowest(self, pencil: Pencil, k: int, report: Report = silent) -> RawPairs:
+        """Return the k lowest eigenpairs; the bound is NaN, because the method has no certificate."""
         moved, origin = from_lower_bound(pencil)
         assert isinstance(moved, Pencil)
         assert isinstance(moved.space, GridSpace)

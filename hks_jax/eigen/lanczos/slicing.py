@@ -7,6 +7,7 @@ factorisation, at a shift above the wanted eigenvalues, is the certificate: its 
 eigenvalues below the shift. Small slices keep orthogonalisation cheap for any number of wanted pairs.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -217,8 +218,9 @@ def _consider(
     multiple = trial.sound & (missing > 2 * plan.block) & (below == state.far_below)
     # If an eigenvalue has more copies than pairs are wanted, some suffice, and the certificate ends just below it.
     cut = multiple & jnp.isfinite(last)
-    lowest = jnp.where(state.reached > 0, state.reached, problem.lowest)
-    accurate = state.stuck | (trial.error <= _ERROR * _needed(problem, plan, lowest))
+    reached = jnp.where(state.reached > 0, state.reached, problem.lowest)
+    needed = _allowed(problem, plan, state, reached, jnp.min(state.values))
+    accurate = state.stuck | (trial.error <= _ERROR * needed)
     # Moving the shift takes less time than refining all solves, so solves are refined only if a move does not help.
     moves = ~(finished | too_many) & jnp.where(trial.sound, ~accurate & (state.moved < 1), state.moved < _MOVES)
 
@@ -247,10 +249,19 @@ def _consider(
     return searchable, searchable & crowded(plan, state), state
 
 
-def _needed(problem: Problem, plan: SlicingPlan, lowest: Scalar, excuse: Scalar | float = 1.0) -> Scalar:
-    """Return the largest residual ‖Kφ − λMφ‖/‖Mφ‖ at which the lowest missing eigenvalue counts as converged."""
-    rounding = excuse * indistinct(problem.pencil, lowest.dtype)
-    return allowed_residuals(jnp.maximum(lowest, problem.unit), rounding, plan.tolerance)
+def _allowed(problem: Problem, plan: SlicingPlan, state: SlicingState, values: Array, lowest: Scalar) -> Array:
+    """Return the largest residuals ‖Kφ − λMφ‖/‖Mφ‖ at which eigenvalues count as converged.
+
+    The tolerance is relative to the eigenvalue, if the spectrum begins at zero. If it begins at some ``lowest``
+    eigenvalue, the tolerance is relative to the distance from this one, but at least to the mean gap.
+    """
+    # If the last search found no pair, as on a very elongated domain, larger rounding errors are accepted.
+    rounding = jnp.where(state.stuck, _EXCUSE, 1).astype(values.dtype) * indistinct(problem.pencil, values.dtype)
+    begins = (problem.unit > 0) & jnp.isfinite(lowest)
+    last = jnp.maximum(state.shift, jnp.max(jnp.where(jnp.isfinite(state.values), state.values, -jnp.inf)))
+    gap = (last - lowest) / jnp.maximum(jnp.maximum(state.below, state.known), 1).astype(values.dtype)
+    unit = jnp.where(begins & (gap > 0), jnp.minimum(gap, problem.unit), problem.unit)
+    return allowed_residuals(jnp.maximum(values - jnp.where(begins, lowest, 0), unit), rounding, plan.tolerance)
 
 
 def search(
@@ -350,11 +361,9 @@ def _accept(
 
     values, residuals, _ = measure_pairs(problem.pencil, vectors)
     first_nonzero = jnp.sort(jnp.concatenate([state.values, values]))[plan.nulls]
-    scale = jnp.maximum(jnp.abs(values), jnp.maximum(first_nonzero, problem.unit))
-    # If the last search found no pair, as on a very elongated domain, larger rounding errors are accepted.
-    excuse = jnp.where(state.stuck, _EXCUSE, 1).astype(dtype)
-    allowed = allowed_residuals(scale, excuse * indistinct(problem.pencil, dtype), plan.tolerance)
-    converged = (residuals <= allowed) & (theta != 0)
+    lowest_of_all = jnp.minimum(jnp.min(state.values), jnp.min(jnp.where(theta != 0, values, jnp.inf)))
+    allowed = partial(_allowed, problem, plan, state, lowest=lowest_of_all)
+    converged = (residuals <= allowed(jnp.maximum(jnp.abs(values), first_nonzero))) & (theta != 0)
     # Pairs may be missing above the first pair that did not converge, and beyond the examined pairs.
     above = near > shift
     limit = jnp.min(jnp.where(above & ~converged, near, jnp.inf))
@@ -365,8 +374,7 @@ def _accept(
     # Later searches stay orthogonal to the known vectors. If known vectors had components along missing eigenvectors,
     # whose eigenvalues may be much smaller, the missing pairs could not converge. So if pairs are missing, accept only
     # vectors that are accurate enough for the missing pairs.
-    needed = _needed(problem, plan, jnp.maximum(state.reached, first_nonzero), excuse)
-    accepted &= complete | (residuals <= needed)
+    accepted &= complete | (residuals <= allowed(jnp.maximum(state.reached, first_nonzero)))
 
     order = jnp.argsort(jnp.where(accepted, values, jnp.inf))
     count = jnp.sum(accepted)
