@@ -100,7 +100,8 @@ def check(seed: int) -> Outcome:
 
 def _check_band(rng: np.random.Generator, pairs: Any, exact: Spectrum, top: float, what: str) -> None:
     """Compare the share of all eigenpairs between two random places in gaps of the spectrum."""
-    gaps = [0, *(1 + np.flatnonzero(np.diff(exact.values[: pairs.k]) > 1e-6 * top))]
+    kept = int(np.asarray(pairs.kept).sum())
+    gaps = [0, *(1 + np.flatnonzero(np.diff(exact.values[:kept]) > 1e-6 * top))]
     low, high = sorted(rng.choice(gaps, 2, replace=False)) if len(gaps) > 1 else (0, 0)
     if low == high:
         return
