@@ -70,11 +70,10 @@ class ShiftInvert(Eigensolver[Pencil]):
         n, dtype, dimension = pencil.space.n_dof, pencil.stiffness.dtype, pencil.space.dimension
         data, matrices = host_matrices(pencil)
         known = pencil.null_space is not None
-        bound = 0.0 if known else np.nan if pencil.lower_bound is None else pencil.lower_bound
+        lowest = 0.0 if known else np.nan if pencil.lower_bound is None else pencil.lower_bound
 
-        def solve(bound: ArrayLike, volume: ArrayLike, *data: ArrayLike) -> tuple[np.ndarray, ...]:
-            K, M = matrices(*data)
-            origin = float(np.asarray(bound))
+        def solve(lowest: ArrayLike, volume: ArrayLike, *data: ArrayLike) -> tuple[np.ndarray, ...]:
+            (K, M), origin = matrices(*data), float(np.asarray(lowest))
             if not known:
                 origin = _lower_bound(K, M) if np.isnan(origin) else origin
                 K = K - origin * M
@@ -96,7 +95,7 @@ class ShiftInvert(Eigensolver[Pencil]):
                     values, vectors, bound = self._lanczos(K, M, k, spread, report)
             return tuple(np.asarray(result, dtype) for result in (values + origin, vectors, bound + origin))
 
-        inputs = (bound, jnp.inf if pencil.volume is None else pencil.volume, *data)
+        inputs = (lowest, jnp.inf if pencil.volume is None else pencil.volume, *data)
         if is_traced(inputs):
             shapes = tuple(jax.ShapeDtypeStruct(shape, dtype) for shape in ((k,), (k, n), ()))
             return jax.pure_callback(solve, shapes, *inputs, vmap_method="sequential")
