@@ -102,6 +102,7 @@ def test_a_slice_reads_its_part_of_a_volume_of_maps_and_saved_pairs_serve(tensor
     assert np.isnan(image.get_fdata()).all(axis=-1).sum() == (~MASK[..., 3]).sum()
 
 
+@pytest.mark.slow
 def test_surfaces_and_tetrahedra(tmp_path, capsys):
     mesh = surface(tmp_path / "s.surf.gii")
     np.save(tmp_path / "x.npy", np.asarray(mesh.vertices)[:, 0])
@@ -164,6 +165,7 @@ def test_maps_that_are_refused(tensors, series, tmp_path, capsys):
     assert "modes.npy: this input file would be replaced by the output" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_surface_in_gives_a_surface_out(tmp_path):
     """FreeSurfer's surface and map in; values in GIFTI out, in the order of the vertices, with their times."""
     mesh = surface(tmp_path / "s.surf.gii")

@@ -56,6 +56,7 @@ def test_curvature_from_a_function_is_exact():
     np.testing.assert_allclose(hj.gaussian_curvature(field), torus_curvature(v), atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("periodic", [True, False])
 def test_nodal_curvature_converges_at_high_order(periodic):
     errors = []

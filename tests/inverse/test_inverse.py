@@ -380,6 +380,7 @@ def test_only_nodes_inside_the_mask_count_in_a_penalty(penalty):
         penalty(2.0, field).residuals(unknowns, unknowns.start(), whole)
 
 
+@pytest.mark.slow
 def test_a_search_from_several_starts_keeps_its_best_fit_and_how_it_ended(tmp_path):
     grid = hj.Grid((5, 5), 0.25)
     flat = hj.TensorField(grid, np.tile(np.eye(2), (5, 5, 1, 1)))

@@ -79,7 +79,8 @@ def test_a_fibre_on_a_surface_through_an_oblique_volume(tmp_path, volume, name, 
     np.testing.assert_allclose(lowest, np.pi**2 * ACROSS / 64, rtol=0.02)
 
 
-@pytest.mark.parametrize("volume", [1, pytest.param(-1, marks=pytest.mark.slow)], indirect=True)
+@pytest.mark.slow
+@pytest.mark.parametrize("volume", [1, -1], indirect=True)
 def test_the_command_line_and_what_is_refused(tmp_path, volume, capsys):
     image, affine = volume
     places, faces = square(affine)
@@ -103,6 +104,7 @@ def test_the_command_line_and_what_is_refused(tmp_path, volume, capsys):
         hj.io.read_mesh(tmp_path / "rh.white", in_space=True)
 
 
+@pytest.mark.slow
 def test_a_spot_on_a_surface_is_smoothed_along_the_fibre(tmp_path, volume):
     """The mean over the surface's axes of the squared FWHM is the square of the number given, in mm."""
     image, affine = volume

@@ -85,6 +85,7 @@ def test_projectors_on_multiplets_have_exact_derivatives(rng, noise, tolerance):
         np.testing.assert_allclose(gradient, expected, atol=accurate_to * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_simple_eigenpairs_have_exact_derivatives_beside_multiple_ones(rng):
     """Of a pencil, with respect to both matrices; the eigenvector's sign is fixed by one entry."""
     A, B = pencil(rng)

@@ -123,6 +123,7 @@ def test_gradient_by_the_tensors_of_a_grid_against_differences(rng):
     np.testing.assert_allclose(slope, directional(value, tensors, change), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_under_vmap_over_entries_and_shifts(rng):
     pencil = hj.sparse_pencil(graph_laplacian(2, 30))
     entries = pencil.stiffness.entries * jnp.asarray(rng.uniform(1, 1.1, (3, 1)))

@@ -25,9 +25,10 @@ def close(found, expected, digits=1e-11):
     np.testing.assert_allclose(found, expected, rtol=0, atol=digits * np.abs(expected).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("boundary", "interpolation"),
-    [(("periodic", "dirichlet"), "linear"), pytest.param("neumann", "log-euclidean", marks=pytest.mark.slow)],
+    [(("periodic", "dirichlet"), "linear"), ("neumann", "log-euclidean")],
 )
 def test_assembly_is_differentiated_as_within_jit(boundary, interpolation):
     rng = np.random.default_rng(0)

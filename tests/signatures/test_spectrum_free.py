@@ -244,7 +244,7 @@ def test_traced_values_need_settings_and_settings_must_fit():
         jax.grad(jax.grad(lambda s: loss(s, method=settings)))(1.0)
 
 
-@pytest.mark.parametrize("method", ["selected-inversion", "colouring"])
+@pytest.mark.parametrize("method", [pytest.param("selected-inversion", marks=pytest.mark.slow), "colouring"])
 def test_amplified_errors_give_nan(method):
     """Errors grow as exp(−vt) with the least potential v; for a constant potential the signature grows as fast."""
     field = flat((8, 7), (1.4, 1.2))
