@@ -55,7 +55,7 @@ class Eigenpairs(eqx.Module):
         eigenvalues: (k,) in ascending order, in 1/(metric length)²; exactly 0 for null vectors.
         residuals: (k,) ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁), where λ₁ is the first positive eigenvalue. If the null
             space is unknown, max(λ, λ₁) is replaced by the larger of two numbers: the mean gap of the eigenvalues, and
-            the distance of λ from `spectral_origin`.
+            the distance of λ from the spectrum's known lower bound or, without one, from the lowest eigenvalue.
         converged: (k,) whether the residual is at most the solver's tolerance, or at most the level of rounding.
         rounding: (k,) for small eigenvalues of float32 matrices, the error that rounding of the matrices' entries may
             cause; 0 for other eigenvalues, and for eigenvalues that are zero in float64 too. An eigenvalue is small if

@@ -80,7 +80,10 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
             number = max(k, int(below))
             if number > self.max_pairs(pencil.size):
                 return Dense().lowest(pencil, k)
-        plan, moved = self.plan(number), _moved(pencil, origin, reach, reach / jnp.maximum(below, 1))
+        plan, moved = (
+            self.plan(number),
+            _moved(pencil, origin, reach, reach / jnp.maximum(below, 1).astype(reach.dtype)),
+        )
         values, vectors, bound = self._by_slices(moved, plan, report)
         spread = values[-1] - values[0]
         if not is_traced(values) and spread > indistinct(pencil, values.dtype) and values[0] > FAR * spread:
