@@ -26,7 +26,7 @@ BIN := $(VENV)/bin
 STAMPS := $(VENV)/.stamps
 BRAIN := mdt==1.2.7
 # What rounding and the order of operations reach first: solvers, factorisations and derivatives.
-CORE := $(addprefix tests/,$(patsubst %,eigen/test_%.py,eigenpairs block_lanczos derivatives interval_derivatives) \
+CORE := $(addprefix tests/,$(patsubst %,eigen/test_%.py,eigenpairs block_lanczos derivatives) \
     signatures/test_float32.py fem/test_assembly.py project/test_outermost_derivatives.py)
 
 # What calls the libraries that the package stands on: those for files, jax and scipy, matplotlib, lineax and optimistix.
