@@ -47,7 +47,7 @@ NO_NOISE = "this option needs tensors; saved eigenpairs and meshes with the Eucl
 
 
 class Domain(NamedTuple):
-    """A mesh with its metric, the tensors of which the metric is made, and the function that makes it."""
+    """A mesh with a metric, the tensors behind the metric, and the function from such tensors to the mesh."""
 
     mesh: Mesh
     tensors: np.ndarray | None  # at the vertices or cells of the mesh, or at the voxels of the volume
@@ -58,24 +58,28 @@ class Domain(NamedTuple):
 def domain_of(args: argparse.Namespace, progress: Progress) -> Domain:
     """Read the mesh, and the tensors that give it a metric, from the options; raise ValueError for other options."""
     _check_options(args)
-    with progress.stage("reading", str(args.file)):
-        volume = volume_around(args, progress)
-        return read_domain(
-            args.file,
-            volume,
+    return domain_in(args.file, args.metric, args, progress)
+
+
+def domain_in(file: Path, metric: MetricChoice | None, args: argparse.Namespace, progress: Progress) -> Domain:
+    """Read a mesh, and the tensors that give it the chosen metric, from the options."""
+    with progress.stage("reading", str(file)):
+        return _read_domain(
+            file,
+            _volume_around(args, progress),
             progress,
             dtype=args.dtype,
             clean=args.clean,
             inside=args.inside,
             array=args.array,
             order=args.order,
-            metric=args.metric,
+            metric=metric,
             operator=args.operator,
             interpolation=args.interpolation,
         )
 
 
-def volume_around(args: argparse.Namespace, progress: Progress) -> TensorVolume | None:
+def _volume_around(args: argparse.Namespace, progress: Progress) -> TensorVolume | None:
     """Read the volume of ``--tensors``, if this option is given."""
     if not args.tensors:
         return None
@@ -133,7 +137,7 @@ def check_boundary(boundary: BoundarySpec | None) -> None:
         raise ValueError(f"--boundary: got {boundary!r}; expected {', '.join(MESH_BOUNDARIES)} for a mesh")
 
 
-def read_domain(
+def _read_domain(
     file: Path,
     volume: TensorVolume | None,
     progress: Progress,

@@ -33,7 +33,7 @@ from jaxtyping import Bool
 from hks_jax import SurfaceMesh, TensorField, gaussian_scale_space
 from hks_jax.cli.computation import Settings, describe_input, field_of
 from hks_jax.cli.info import describe_mesh
-from hks_jax.cli.meshes import OF_VERTICES, Domain, check_boundary, images_of_mesh, read_domain, volume_around
+from hks_jax.cli.meshes import OF_VERTICES, Domain, check_boundary, domain_in, images_of_mesh
 from hks_jax.cli.options import READING, options_in, refuse
 from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.progress import Progress
@@ -136,20 +136,7 @@ def _on_mesh(args: argparse.Namespace, progress: Progress) -> _Place:
         of_grids += [o.name for o in options_in(READING) if o.name not in ("order", "array")]
     refuse(args, of_grids, "this option is for tensors on a grid; leave it out for a mesh")
     check_boundary(args.boundary)
-    with progress.stage("reading", str(args.mesh)):
-        found = read_domain(
-            args.mesh,
-            volume_around(args, progress),
-            progress,
-            dtype=args.dtype,
-            clean=args.clean,
-            inside=args.inside,
-            array=args.array,
-            order=args.order,
-            metric=None if args.operator == "fick" else "inverse",
-            operator=args.operator,
-            interpolation=args.interpolation,
-        )
+    found = domain_in(args.mesh, None if args.operator == "fick" else "inverse", args, progress)
     mesh = found.mesh
     (images, origin), about = images_of_mesh(args.mesh, mesh, args.clean), describe_mesh(args.mesh, mesh)
     about |= {"source": str(args.mesh), "tensors": None if args.tensors is None else str(args.tensors)}

@@ -115,15 +115,10 @@ def _total(pencil: AnyPencil, shift: Scalar) -> tuple[Number, Flag, Flag]:
     return sum(counts, jnp.zeros((), int)), jnp.all(jnp.stack(sound)), jnp.all(jnp.stack(clear))
 
 
-def certain_count(pencil: SymmetricPencil, shift: Scalar) -> Count:
-    """Return the number of eigenvalues of one pencil below a shift, and whether this number is certain."""
-    return _counted(pencil, dissect(pencil.pattern), shift)[:2]
-
-
 # The nested dissection is an argument, because compilation with so large a constant (74 MB at 1024² nodes) is slow.
 @jit_quickly()
 def _counted(pencil: SymmetricPencil, dissection: Dissection, shift: Scalar) -> tuple[Number, Flag, Scalar]:
-    """Return the result of `certain_count`, and the rate of `Trial`."""
+    """Return the number of eigenvalues below a shift, whether it is certain, and the rate of `Trial`."""
     factor, trial, _ = certain_factorisation(dissection, pencil, shift)
     return factor.negative, trial.sound, trial.rate
 

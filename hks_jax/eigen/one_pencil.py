@@ -65,8 +65,8 @@ def _pairs(pencil: Pencil, found: tuple[Any, ...], solver: Eigensolver) -> Eigen
     constants = jax.lax.stop_gradient((pencil, frame, values, following))
     matrices = tabulated(SymmetricPencil(constants[0].stiffness, constants[0].mass))
     stored = double and _single_on_host(values, constants)
-    lowest = constants[2][0] if pencil.lower_bound is None else constants[0].lower_bound
-    quality = _quality(matrices, *constants[1:], lowest, pencil.n_null, solver.tolerance, known, stored)
+    settings = pencil.n_null, solver.tolerance, known, stored
+    quality = _quality(matrices, *constants[1:], constants[0].lower_bound, *settings)
     residuals, converged, zero, tolerance = quality
     small, rounding = _near_zero(*constants[:3], zero, double)
     if not known:
@@ -127,7 +127,7 @@ def _quality(
     vectors: Any,
     values: Any,
     following: Any,
-    lowest: Any,
+    lower_bound: Any,
     n_null: int,
     tolerance: float,
     known: bool,
@@ -136,8 +136,8 @@ def _quality(
     """Return residuals, convergence flags, flags of zero eigenvalues, and the multiplet tolerance.
 
     If the null space is known, each residual is divided by its eigenvalue, but at least by the first positive one.
-    Otherwise it is divided by the distance of its eigenvalue from the ``lowest`` one, or from a known lower bound, but
-    at least by the mean gap. If all eigenvalues are equal within rounding, the divisor is the result of `largest_of`.
+    Otherwise it is divided by the distance of its eigenvalue from the lowest one, or from a known lower bound, but at
+    least by the mean gap. If all eigenvalues are equal within rounding, the divisor is the result of `largest_of`.
     """
     measure = measured_on_host if xp is np else measure_pairs
     (_, residuals, twice), k = measure(pencil, vectors, values), values.size
@@ -147,6 +147,7 @@ def _quality(
         scale = xp.maximum(xp.abs(values), xp.abs(values[min(n_null, k - 1)]))
     else:
         last = xp.where(xp.isfinite(following), following, values[-1])
+        lowest = values[0] if lower_bound is None else lower_bound
         scale = xp.maximum(values - lowest, (last - values[0]) / k)
         scale = xp.where(scale > 100 * rounding, scale, size)
     scale = xp.where(scale > 0, scale, xp.where(size > 0, size, 1)).astype(values.dtype)

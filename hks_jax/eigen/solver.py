@@ -20,7 +20,7 @@ from hks_jax.linear.dense_eigh import pencil_eigh
 from hks_jax.linear.host_matrices import host_matrices
 from hks_jax.linear.symmetric_pencil import P, SymmetricPencil
 
-FAR = 30
+_FAR = 30
 """The largest distance of an origin below the wanted eigenvalues, in units of the spread of these eigenvalues."""
 
 RawPairs = tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, ""]]
@@ -43,6 +43,16 @@ class Status(str):
         status = super().__new__(cls, text)
         status.seconds_left = seconds_left
         return status
+
+
+def is_remote(values: Float[Array | np.ndarray, " k"], rounding: Float[Array, ""] | float) -> bool:
+    """Return whether to solve again from an origin nearer to the spectrum, given the eigenvalues' distances from it.
+
+    Distances from a remote origin have fewer correct digits. If all eigenvalues are equal within rounding, the lost
+    digits do not matter. Values must be concrete.
+    """
+    spread = values[-1] - values[0]
+    return bool(spread > rounding and values[0] > _FAR * spread)
 
 
 def silent(text: str) -> None:

@@ -50,16 +50,13 @@ def conjugate_gradients(
     precondition: Callable[[Array], Array],  # maps residuals rᵢ to approximations of Aᵢ⁻¹rᵢ
     rhs: Float[Array, "n b"],
     wanted: Float[Array, " b"],  # the wanted relative error in the energy norm; if infinite, the column stays zero
-    inner: Callable[[Array, Array], Array] = lambda x, y: (x * y).sum(axis=0),
     clean: Callable[[Array], Array] | None = None,
     most: Int[Array, ""] | int = _MOST_STEPS,  # the maximal number of steps
     orthogonal: bool = False,
 ) -> Solution:
-    """Solve Aᵢxᵢ = rhsᵢ for a block of columns.
+    """Solve Aᵢxᵢ = rhsᵢ for a block of columns. All Aᵢ and the preconditioner are symmetric and positive definite.
 
     Args:
-        inner: the function that returns the inner products (b,) of two blocks of columns. All Aᵢ and the preconditioner
-            must be symmetric and positive definite with respect to ``inner``.
         clean: the projection onto the subspace in which all Aᵢ are positive definite. If rounding makes an inner
             product rᵢᵀzᵢ or pᵢᵀAᵢpᵢ nonpositive, the iteration restarts from the projected solutions.
         orthogonal: whether to reorthogonalise residuals, which reduces the number of steps for ill-conditioned
@@ -78,7 +75,7 @@ def conjugate_gradients(
 
     def direct(state: Solution) -> Solution:
         z = precondition(state.r)
-        energy, begin = inner(state.r, z), state.steps == 0
+        energy, begin = (state.r * z).sum(axis=0), state.steps == 0
         change = xp.where(state.going & ~state.fresh, energy / state.energy, 0)
         p = xp.where(state.going, z + change[(None,) * (z.ndim - change.ndim)] * state.p, 0)
         z = z if orthogonal else state.z
@@ -87,7 +84,7 @@ def conjugate_gradients(
     def advance(state: Solution) -> tuple[Solution, Bool[Array, " b"]]:
         p, begin = state.p, state.steps < 0
         image, least = product(p, begin) if orthogonal else product(p)
-        curvature = inner(p, image)
+        curvature = (p * image).sum(axis=0)
         regular = ~((curvature <= least) | (state.energy <= 0)) | begin
         length = xp.where(state.going & regular, state.energy / xp.where(regular & ~begin, curvature, 1), 0)
         length = xp.where(begin, -1, length)

@@ -36,7 +36,7 @@ OfRows = Float[Array, " k"]
 Columns = Float[Array, "n_dof b"]
 Shifts = Float[Array, " groups"]
 
-SINGULAR = 1e-8
+_SINGULAR = 1e-8
 """The Rayleigh quotient below which K − λᵢM counts as singular, relative to the first eigenvalue on the complement."""
 _LEAST = 100
 """In units of ε: the least relative tolerance, and the relative norm at which a projected right-hand side is zero."""
@@ -87,7 +87,7 @@ def definite_product(
 
     def product(x: Columns) -> tuple[Columns, Float[Array, " b"]]:
         image = mass(x)
-        return stiffness(x) - shifts[None] * image, SINGULAR * beyond * (x * image).sum(axis=0)
+        return stiffness(x) - shifts[None] * image, _SINGULAR * beyond * (x * image).sum(axis=0)
 
     return product
 

@@ -97,7 +97,8 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         plan = self.plan(k, moved.space)
         compute = _compiled if is_traced(moved) else _lowest
         values, vectors = compute(moved, plan, self.max_rounds, report)
-        return values + origin, vectors, jnp.asarray(jnp.nan, values.dtype)
+        values = values if pencil.null_space is not None else values + origin
+        return values, vectors, jnp.asarray(jnp.nan, values.dtype)
 
     def guards(self, k: int, n_dof: int) -> int:
         """Return the number of guard pairs that keep linear solves well conditioned: half of the additional vectors."""

@@ -8,9 +8,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hks_jax.arrays import Scalar
 from hks_jax.checks import require_count
 from hks_jax.compilation import jit_quickly
-from hks_jax.eigen.inertia import Scalar, dissected, locate
+from hks_jax.eigen.inertia import dissected, locate
 from hks_jax.eigen.lanczos.slicing import (
     Problem,
     SlicingPlan,
@@ -22,7 +23,7 @@ from hks_jax.eigen.lanczos.slicing import (
     unfinished,
 )
 from hks_jax.eigen.quality import indistinct, measure_pairs
-from hks_jax.eigen.solver import FAR, Dense, Eigensolver, RawPairs, Report, silent
+from hks_jax.eigen.solver import Dense, Eigensolver, RawPairs, Report, is_remote, silent
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.loops import when, while_loop
@@ -80,15 +81,10 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
             number = max(k, int(below))
             if number > self.max_pairs(pencil.size):
                 return Dense().lowest(pencil, k)
-        plan, moved = (
-            self.plan(number),
-            _moved(pencil, origin, reach, reach / jnp.maximum(below, 1).astype(reach.dtype)),
-        )
-        values, vectors, bound = self._by_slices(moved, plan, report)
-        spread = values[-1] - values[0]
-        if not is_traced(values) and spread > indistinct(pencil, values.dtype) and values[0] > FAR * spread:
-            # Solve again from an origin nearer to the spectrum, because distances of eigenvalues from a remote origin
-            # have fewer correct digits. If all eigenvalues are equal, the lost digits do not matter.
+        plan, spacing = self.plan(number), reach / jnp.maximum(below, 1).astype(reach.dtype)
+        values, vectors, bound = self._by_slices(_moved(pencil, origin, reach, spacing), plan, report)
+        if not is_traced(values) and is_remote(values, indistinct(pencil, values.dtype)):
+            spread = values[-1] - values[0]
             origin = origin + values[0] - spread
             moved = _moved(pencil, origin, 2 * spread, spread / number)
             values, vectors, bound = self._by_slices(moved, plan, report)

@@ -16,7 +16,7 @@ from hks_jax.checks import require_count
 from hks_jax.eigen.adjoints.complement import Adjoint
 from hks_jax.eigen.quality import largest_of
 from hks_jax.eigen.shift_invert.host_adjoint import HostAdjoint
-from hks_jax.eigen.solver import FAR, Eigensolver, RawPairs, Report, Status, silent
+from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, Status, is_remote, silent
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.host_matrices import factorise_on_host, host_matrices, inertia_on_host
 from hks_jax.traced import is_traced
@@ -86,10 +86,8 @@ class ShiftInvert(Eigensolver[Pencil]):
             # More BLAS threads hardly accelerate ARPACK's products with its basis, and slow them down on busy cores.
             with threadpool_limits(1, user_api="blas"):
                 values, vectors, bound = self._lanczos(K, M, k, shift, report)
-                spread = values[-1] - values[0]
-                if not known and spread > _rounding(K, M) and values[0] > FAR * spread:
-                    # Solve again from an origin nearer to the spectrum, because distances of eigenvalues from a remote
-                    # origin have fewer correct digits.
+                if not known and is_remote(values, _rounding(K, M)):
+                    spread = values[-1] - values[0]
                     nearer = values[0] - spread
                     origin, K = origin + nearer, K - nearer * M
                     values, vectors, bound = self._lanczos(K, M, k, spread, report)
