@@ -526,8 +526,7 @@ def test_identifiability_is_the_spectrum_of_the_information(rng):
     assert 0 < report.effective <= 12
     assert (report.deviation <= 1).all()
     # Fewer times, less information.
-    fewer = hj.fit_metric(flat, target[2:], times[2:], "conformal", k=k, search=Search(max_steps=1))
-    poorer = identifiability(fewer.problem, fit.values, n=12, n_weak=1, iterations=6)
+    poorer = identifiability(problem_of(target[2:], times[2:], flat, k), fit.values, n=12, n_weak=1, iterations=6)
     assert poorer.strengths[11] < report.strengths[11]
 
 
