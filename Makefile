@@ -3,6 +3,7 @@
 #   make demo        the heat kernel signature of a real brain slice: pictures in demo/
 #   make test        the tests
 #   make test-slow   the tests that take minutes
+#   make test-all    both in one session, which shares what is compiled
 #   make test-optimised   tests of the numerical core, compiled as users have it
 #   make test-lowest   a few tests with the lowest versions that pyproject.toml allows
 #   make stress      random problems against independent answers, an hour of them
@@ -38,7 +39,8 @@ LIBRARIES := $(addprefix tests/,project/test_import.py io/test_io.py io/test_nrr
     cli/test_cli.py::test_npz_end_to_end_equals_the_library)
 LOWEST := $(VENV)/lowest
 
-.PHONY: browser demo test test-slow test-optimised test-lowest stress lint notebooks docs tables dist clean
+.PHONY: browser demo test test-slow test-all test-optimised test-lowest stress lint notebooks docs dist tools tables \
+    clean
 .DELETE_ON_ERROR:
 
 demo: $(STAMPS)/dti $(STAMPS)/brain
@@ -49,6 +51,9 @@ test: $(STAMPS)/test
 
 test-slow: $(STAMPS)/test
 	$(ONE_THREAD) $(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m slow
+
+test-all: $(STAMPS)/test
+	$(ONE_THREAD) $(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 
 # The other tests are compiled with hardly an optimisation; an empty XLA_FLAGS leaves them all on.
 test-optimised: $(STAMPS)/test
@@ -102,11 +107,16 @@ $(STAMPS)/venv:
 	$(PYTHON) -m venv $(VENV)
 	@mkdir -p $(STAMPS) && touch $@
 
-# One extra of pyproject.toml each: dti, train, test, lint, docs, dist.
+# One extra of pyproject.toml each: dti, train, test, lint, docs, dist. That for tests includes the first two.
 EXTRAS := $(addprefix $(STAMPS)/,dti train test lint docs dist)
 $(EXTRAS): $(STAMPS)/%: pyproject.toml $(STAMPS)/venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[$*]"
-	@touch $@
+	@touch $@ $(if $(filter test,$*),$(STAMPS)/dti $(STAMPS)/train)
+
+# Three extras at once, so that lint, docs and dist can then run beside each other: pip cannot.
+tools: $(STAMPS)/venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[lint,docs,dist]"
+	@touch $(addprefix $(STAMPS)/,lint docs dist)
 
 # Of what the libraries require in turn, the newest.
 $(STAMPS)/lowest: pyproject.toml $(STAMPS)/venv
