@@ -39,7 +39,7 @@ def apply(x, matrix=A, host_map=by_numpy):
 
 @pytest.mark.parametrize("host_map", [by_numpy, None, lambda power, matrix: None])
 @pytest.mark.parametrize(
-    "use, wanted",
+    ("use", "wanted"),
     [
         (lambda f: f(jnp.asarray(X)), A**2 @ X),
         (lambda f: jax.jvp(f, (X,), (2 * X,))[1], 2 * A**2 @ X),
