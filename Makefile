@@ -71,9 +71,10 @@ lint: $(STAMPS)/lint
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# Two at a time, as each leaves a core idle half of its time.
+# Two at a time, as each leaves a core idle half of its time; compiled as in tests.
 notebooks: $(STAMPS)/dti $(STAMPS)/train $(STAMPS)/brain
-	printf '%s\n' notebooks/*.py | MPLBACKEND=Agg $(ONE_THREAD) xargs -P 2 -n 1 -t $(BIN)/python
+	export XLA_FLAGS="$$($(BIN)/python tests/compiler_flags.py)" && \
+	    printf '%s\n' notebooks/*.py | MPLBACKEND=Agg $(ONE_THREAD) xargs -P 2 -n 1 -t $(BIN)/python
 
 # Not --quiet: what is not printed is not counted, and the build would pass with broken links.
 docs: $(STAMPS)/docs

@@ -7,19 +7,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import jax
-import jaxlib
 import jaxtyping
 import matplotlib
 import numpy as np
 import pytest
+from compiler_flags import FLAGS
 
 # From here on every call of a function of the package is checked against its annotations, shapes included.
 jaxtyping.install_import_hook("hks_jax", "annotations.checked")
 
-# Tests are small and many: they wait for the compiler, which without these flags takes four times as long.
-FLAGS = ["--xla_backend_optimization_level=0", "--xla_llvm_disable_expensive_passes=true"]
-if jaxlib.__version__.startswith("0.10."):  # an unknown flag would be fatal
-    FLAGS += ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
 os.environ.setdefault("XLA_FLAGS", " ".join(FLAGS))
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
