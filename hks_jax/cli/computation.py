@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import hks_jax as hj
-from hks_jax.cli.options import SOLVING, as_options, defaults
+from hks_jax.cli.options import add_metric, add_signature, add_solving, defaults
 from hks_jax.cli.parsing import Times, parse_times
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
@@ -28,6 +28,10 @@ EARLY = 0.02
 """The truncated share of the signature above which the boundary's influence is estimated without eigenpairs."""
 HALF = 0.45
 """The share of nodes free of the boundary below which a time is warned of; automatic times aim at one half."""
+
+
+INPUT_ERRORS = (ValueError, FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError, ImportError)
+"""Errors that a user can correct: wrong values, missing files, missing extras. Others are failed computations."""
 
 
 class ComputationError(RuntimeError):
@@ -57,7 +61,7 @@ class Settings:
     @classmethod
     def of(cls, args: argparse.Namespace | None = None, **given: Any) -> "Settings":
         """Return the settings in `args`, or else the default settings; settings in `given` replace some of them."""
-        chosen = vars(defaults(f"@metric {SOLVING} @signature")) | (vars(args) if args else {})
+        chosen = defaults(add_metric, add_solving, add_signature) | (vars(args) if args else {})
         metric = chosen["metric"] or (None if chosen["operator"] == "fick" else "tensor")
         given = {"metric": metric, "times": parse_times(chosen["times"]), **given}
         return cls(**{field.name: chosen[field.name] for field in fields(cls)} | given)
@@ -192,7 +196,7 @@ def compute_pairs(volume: TensorVolume, settings: Settings, progress: Progress) 
     grid, boundary = volume.grid(settings.components), settings.boundary
     if boundary is None:
         boundary, why = default_boundary(grid.inside)
-        progress.note(as_options(f"boundary {boundary} ({why})"))
+        progress.note(f"boundary {boundary} ({why})")
     with progress.stage("assembly", f"{int(grid.inside.sum())} of {grid.size} nodes"):
         for message in unreached_sides(grid.inside, boundary):
             progress.warn(message)

@@ -14,8 +14,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from hks_jax.cli import options
 from hks_jax.cli.computation import describe_input
-from hks_jax.cli.options import READING
 from hks_jax.cli.outputs import Done
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read
@@ -23,10 +23,14 @@ from hks_jax.io import find_invalid, save_tensors
 from hks_jax.io.formats import WRITTEN
 from hks_jax.io.repair import describe_invalid
 
-OPTIONS = f"""
-@file {READING}
-output OUT  the file to write; an existing file is replaced
-"""
+USAGE = "FILE OUT"
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    options.add_file(parser)
+    options.add_reading(parser)
+    parser.add_argument("output", type=Path, metavar="OUT", help="the file to write; an existing file is replaced")
 
 
 def writes(args: argparse.Namespace) -> list[Path]:

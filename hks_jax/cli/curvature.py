@@ -17,8 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from hks_jax.cli import options
 from hks_jax.cli.computation import Settings, describe_input, field_of
-from hks_jax.cli.options import READING, refuse
+from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read_volume
@@ -26,11 +27,24 @@ from hks_jax.curvature import gaussian_curvature
 from hks_jax.io import Result
 from hks_jax.io.formats import WRITTEN, format_of
 
-OPTIONS = f"""
-@file @metric {READING} @domain @dtype @output
---periodic x|y|xy  periodic axes, along which the first node follows the last (default none)
-@view
-"""
+USAGE = "FILE -o OUT"
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    options.add_file(parser)
+    options.add_metric(parser)
+    options.add_reading(parser)
+    options.add_components(parser)
+    options.add_dtype(parser)
+    options.add_output(parser)
+    parser.add_argument(
+        "--periodic",
+        choices=("x", "y", "xy"),
+        help="periodic axes, along which the first node follows the last (default none)",
+    )
+    options.add_view(parser)
+
 
 COLOURED = 0.98
 """The quantile of absolute values at the ends of the colour scale; the curvature of noisy tensors has outliers."""

@@ -29,28 +29,48 @@ from pathlib import Path
 import numpy as np
 
 from hks_jax import SurfaceMesh, TensorNoise, TetMesh
+from hks_jax.cli import options
 from hks_jax.cli import pairs as saved_pairs
 from hks_jax.cli.computation import Settings, compute_pairs, result_of, use_dtype
 from hks_jax.cli.info import describe_mesh
-from hks_jax.cli.meshes import NO_NOISE, OF_MESHES, Domain, domain_of, images_of_mesh, solve_mesh
+from hks_jax.cli.meshes import NO_NOISE, Domain, domain_of, images_of_mesh, solve_mesh
 from hks_jax.cli.noise import Noisy, check_noise, noise_of_volume, signature_of, with_error_bars
-from hks_jax.cli.options import READING, SOLVING, options_in, refuse
+from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import PAIRS, REPORT, Done, of_earlier, write_outputs
+from hks_jax.cli.parsing import voxel
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read_volume, require_metric
 from hks_jax.io.formats import format_of
 from hks_jax.io.mesh import is_mesh
 from hks_jax.io.result import Result
 
-OPTIONS = f"""
-@file @metric {READING} @output {SOLVING}
---through I,J,K
-    voxel through which the slices in the picture of a volume pass, or else the nearest voxel in the domain (default: a
-    voxel in the middle)
-{OF_MESHES}
-@signature @noise @view @rim
---save-pairs  write the eigenpairs to OUT/pairs.npz; 'hks-jax hks OUT/pairs.npz --times …' reuses them
-"""
+USAGE = "FILE -o OUT"
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    options.add_file(parser)
+    options.add_metric(parser)
+    options.add_reading(parser)
+    options.add_output(parser)
+    options.add_solving(parser)
+    parser.add_argument(
+        "--through",
+        type=voxel,
+        metavar="I,J,K",
+        help="voxel through which the slices in the picture of a volume pass, or else the nearest voxel in the domain "
+        "(default: a voxel in the middle)",
+    )
+    options.add_meshes(parser)
+    options.add_signature(parser)
+    options.add_noise(parser)
+    options.add_view(parser)
+    options.add_rim(parser)
+    parser.add_argument(
+        "--save-pairs",
+        action="store_true",
+        help="write the eigenpairs to OUT/pairs.npz; 'hks-jax hks OUT/pairs.npz --times …' reuses them",
+    )
 
 
 def writes(args: argparse.Namespace) -> list[Path]:
@@ -67,7 +87,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     refuse(args, ("tensors",), "this option is for a mesh inside a volume; leave it out for the volume itself")
     if saved := not args.others and saved_pairs.is_saved_pairs(args.file):
         refuse(args, ("noise",), NO_NOISE)
-        settled = [option.name for option in options_in(f"@metric {READING} {SOLVING}")]
+        settled = options.defaults(options.add_metric, options.add_reading, options.add_solving)
         why = f"the eigenpairs in {args.file} determine this setting; leave the option out"
         refuse(args, (*settled, "save_pairs"), why)
     else:

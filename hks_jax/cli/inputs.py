@@ -7,13 +7,16 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from hks_jax.cli.noise import second_scan
-from hks_jax.cli.options import flag, options_in
+from hks_jax.cli.options import flag
 from hks_jax.io.masks import names_beside
 from hks_jax.io.nifti import is_nifti, siblings, sidecar_of
 from hks_jax.io.result import signature_file
 
-_INPUTS = ("FILE", "RESULT", "SUBJECTS", "TARGET")
-"""The words in the table of options that stand for input files."""
+INPUTS = (
+    *("file", "result", "subjects", "target", "bval", "bvec", "mask", "tensors", "mesh", "inside", "map", "init"),
+    *("anatomy", "labels", "atlas", "names", "checkpoint"),
+)
+"""The options whose values are input files."""
 
 
 def tensor_files(args: argparse.Namespace) -> dict[str, list[str]]:
@@ -33,9 +36,8 @@ def tensor_files(args: argparse.Namespace) -> dict[str, list[str]]:
 
 def _inputs(args: argparse.Namespace) -> Iterator[tuple[str, Path]]:
     """Yield the options and the paths of the existing input files of a command."""
-    names = [option.name for option in options_in(args.command.OPTIONS) if option.settings.get("metavar") in _INPUTS]
     given = vars(args)
-    for name in dict.fromkeys(["file", *names]):
+    for name in INPUTS:
         path = given.get(name)
         if path is not None:
             yield flag(name), signature_file(path)

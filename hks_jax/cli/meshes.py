@@ -13,7 +13,7 @@ from jaxtyping import Bool
 from hks_jax import Eigenpairs, SurfaceMesh, TetMesh, assemble
 from hks_jax.cli.computation import Settings, solve, use_dtype
 from hks_jax.cli.info import listed
-from hks_jax.cli.options import READING, options_in, refuse
+from hks_jax.cli.options import add_reading, defaults, refuse
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read, require_one
 from hks_jax.domain.tensor_checks import Interpolation, MetricChoice, OperatorChoice
@@ -23,23 +23,11 @@ from hks_jax.io import TensorVolume, read_mask, read_mesh, sample_tensors
 from hks_jax.io.cortex import MAPS, structure_of
 from hks_jax.io.mesh import WRITTEN, arrays_by_place, is_surface
 from hks_jax.io.repair import require_valid
+from hks_jax.io.sampling import OutsideMaskError
 from hks_jax.io.tensor_order import Order, matrices
 from hks_jax.optional import optional
 
 Mesh: TypeAlias = SurfaceMesh | TetMesh
-
-OF_VERTICES = """\
-@clean
---inside FILE
-    vertices of a mesh that form the domain, such as a cortical surface without its medial wall: FreeSurfer's .label, or
-    zeros and ones in .npy or in the array 'mask' of an .npz"""
-OF_MESHES = f"""\
-{OF_VERTICES}
---tensors FILE
-    tensors of a volume that contains the mesh (a cortical surface, for example). The tensors are interpolated at the
-    vertices in scanner coordinates (FreeSurfer's surfaces are moved by c_ras, GIFTI's by their transformation). The
-    options on voxels and on the meaning of numbers refer to this file"""
-"""The options of meshes."""
 
 OF_TENSORS = ("metric", "operator", "order", "interpolation")
 """Options that refer to tensors of a mesh."""
@@ -116,7 +104,7 @@ def _check_options(args: argparse.Namespace) -> None:
         raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one mesh")
     of_grids = ["slice", "through", "view", "save_pairs", "components", "method"]
     if not args.tensors:  # with --tensors, the options for reading refer to the volume
-        of_grids += [o.name for o in options_in(READING) if o.name not in (*OF_TENSORS, "array")]
+        of_grids += [name for name in defaults(add_reading) if name not in (*OF_TENSORS, "array")]
     refuse(args, of_grids, "this option is for tensors on a grid; leave it out for a mesh")
     check_boundary(args.boundary)
     if not (args.array or args.tensors):
@@ -177,7 +165,14 @@ def _read_domain(
 
         def sampled(values: Any) -> Mesh:
             tensors = np.zeros((len(vertices), 3, 3), dtype)
-            tensors[at] = sample_tensors(replace(volume, tensors=np.asarray(values)), np.asarray(mesh.vertices)[at])
+            around = replace(volume, tensors=np.asarray(values))
+            try:
+                tensors[at] = sample_tensors(around, np.asarray(mesh.vertices)[at])
+            except OutsideMaskError as error:
+                remedy = (
+                    "Pass a larger --mask, or pass --inside with the vertices inside the mask, to leave the others out"
+                )
+                raise ValueError(f"{error.fact}. {remedy}") from error
             return domain(tensors)
 
         return Domain(sampled(volume.tensors), volume.tensors, volume, sampled)

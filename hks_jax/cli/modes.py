@@ -32,11 +32,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hks_jax import Eigenpairs, ModeEnergies, energy, reconstruct
+from hks_jax.cli import options
 from hks_jax.cli import pairs as saved_pairs
 from hks_jax.cli.computation import Settings, compute_pairs, describe_input, describe_pairs
 from hks_jax.cli.info import describe_mesh
-from hks_jax.cli.meshes import OF_MESHES, domain_of, images_of_mesh, solve_mesh
-from hks_jax.cli.options import READING, SOLVING, options_in, refuse
+from hks_jax.cli.meshes import domain_of, images_of_mesh, solve_mesh
+from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read_volume, require_metric
@@ -49,16 +50,28 @@ from hks_jax.io.mesh import is_mesh, is_surface
 from hks_jax.io.tables import write_json, write_table
 from hks_jax.signatures.modes import lengths_of
 
-OPTIONS = f"""
-@file @metric {READING} @output {SOLVING}
-{OF_MESHES}
---map FILE
-    a map or a series of maps (4D): NIfTI, MRtrix, NRRD or .npy on the voxels of FILE; for a mesh GIFTI, FreeSurfer's
-    maps (lh.thickness, lh.curv, …), .npy, or a mesh with arrays, one value per vertex. NaN marks unmeasured voxels or
-    vertices: the modes are fitted to the others by least squares. Zeros are values. Values outside the mask are not
-    used
-@view
-"""
+USAGE = "FILE -o OUT"
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    options.add_file(parser)
+    options.add_metric(parser)
+    options.add_reading(parser)
+    options.add_output(parser)
+    options.add_solving(parser)
+    options.add_meshes(parser)
+    parser.add_argument(
+        "--map",
+        type=Path,
+        metavar="FILE",
+        help="a map or a series of maps (4D): NIfTI, MRtrix, NRRD or .npy on the voxels of FILE; for a mesh GIFTI, "
+        "FreeSurfer's maps (lh.thickness, lh.curv, …), .npy, or a mesh with arrays, one value per vertex. NaN marks "
+        "unmeasured voxels or vertices: the modes are fitted to the others by least squares. Zeros are values. Values "
+        "outside the mask are not used",
+    )
+    options.add_view(parser)
+
 
 TABLES = ("modes.tsv", "modes.json", "coefficients.tsv", "energies.tsv")
 
@@ -134,7 +147,7 @@ def _on_grid(args: argparse.Namespace, progress: Progress) -> _Solved:
     refuse(args, ("tensors",), "this option is for a mesh inside a volume; leave it out for the volume itself")
     settings = Settings.of(args, boundary=args.boundary or "neumann")
     if not args.others and saved_pairs.is_saved_pairs(args.file):
-        settled = [option.name for option in options_in(f"@metric {READING} {SOLVING}")]
+        settled = options.defaults(options.add_metric, options.add_reading, options.add_solving)
         refuse(args, settled, f"the eigenpairs in {args.file} determine this setting; leave the option out")
         solved, image = saved_pairs.read_pairs(args.file, settings, progress)
     else:

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool
 
-from hks_jax.cli.options import as_options, refuse
+from hks_jax.cli.options import refuse
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.components import label_nodes
 from hks_jax.io import TensorVolume, erode, fit_dwi, positive_tensors, read_mask, read_tensors, repair_tensors
@@ -16,6 +16,7 @@ from hks_jax.io.formats import format_of
 from hks_jax.io.plausibility import reviewed
 from hks_jax.io.repair import find_background, require_valid, without_background
 from hks_jax.io.units import unit_question
+from hks_jax.naming import with_option
 
 
 def require_metric(args: argparse.Namespace, volume: TensorVolume | None = None) -> None:
@@ -91,7 +92,7 @@ def read(args: argparse.Namespace, progress: Progress, ask: Callable[[str], None
             volume = volume.with_mask(erode(volume.inside, args.erode))
         volume = _repaired(volume, args)
     for note in volume.notes:
-        progress.note(as_options(note))
+        progress.note(with_option(note))
     return volume
 
 
@@ -149,10 +150,10 @@ def _reviewed(volume: TensorVolume, args: argparse.Namespace, ask: Callable[[str
     for question in asked:
         if getattr(args, "strict_unit", False) and not volume.unit and question == unit_question(volume):
             raise ValueError(
-                f"{args.file}: {as_options(question)}. The tensors of all subjects must have the same unit. If the "
+                f"{args.file}: {question}. The tensors of all subjects must have the same unit. If the "
                 "numbers are in mm²/s, pass --unit mm2/s, or add a column named unit to the table"
             )
-        ask(as_options(question))
+        ask(question)
     return volume
 
 

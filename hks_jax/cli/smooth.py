@@ -31,11 +31,13 @@ import numpy as np
 from jaxtyping import Bool
 
 from hks_jax import SurfaceMesh, TensorField, gaussian_scale_space
+from hks_jax.cli import options
 from hks_jax.cli.computation import Settings, describe_input, field_of
 from hks_jax.cli.info import describe_mesh
-from hks_jax.cli.meshes import OF_VERTICES, Domain, check_boundary, domain_in, images_of_mesh
-from hks_jax.cli.options import READING, options_in, refuse
+from hks_jax.cli.meshes import Domain, check_boundary, domain_in, images_of_mesh
+from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import REPORT, Done, writing
+from hks_jax.cli.parsing import boundary_conditions
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read_volume
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
@@ -46,25 +48,53 @@ from hks_jax.io.formats import WRITTEN, format_of
 from hks_jax.io.mesh import WRITTEN as MESHES_WRITTEN
 from hks_jax.spectrum_free.smoothing import smooth
 
-OPTIONS = f"""
-file FILE...  the maps
---fwhm LENGTH!
-    mean full width at half maximum of the smoothing, in mm, at least the voxel size, or the median edge of a mesh
---tensors FILE  the diffusion tensors; required unless --mesh is given
---mesh FILE
-    the mesh at whose vertices the maps are. With --tensors, the tensors of this volume are interpolated at the vertices
-    in scanner coordinates, as in 'hks-jax hks'; with --array, the mesh's file has them
-{OF_VERTICES}
-{READING} @domain @dtype @interpolation @output
---operator fick|laplace-beltrami = fick
-    fick: the diffusion of a substance by Fick's law (default), whose density becomes uniform in space.
-    laplace-beltrami: the heat flow of the metric D⁻¹, which keeps the integral with the volume of this metric
---boundary CONDITION = neumann
-    condition at the boundary of the domain: neumann (nothing flows through it, the default); dirichlet (the map is 0 at
-    the sides of the image, or at the boundary of a mesh); dirichlet-rim (also at the boundary of a mask); or periodic.
-    Give one condition for all axes, or one per axis
-@view
-"""
+USAGE = "FILE --fwhm LENGTH -o OUT"
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    parser.add_argument("file", action=options.FirstAndOthers, nargs="+", type=Path, metavar="FILE", help="the maps")
+    parser.add_argument(
+        "--fwhm",
+        type=float,
+        required=True,
+        metavar="LENGTH",
+        help="mean full width at half maximum of the smoothing, in mm, at least the voxel size, or the median edge of "
+        "a mesh",
+    )
+    parser.add_argument(
+        "--tensors", type=Path, metavar="FILE", help="the diffusion tensors; required unless --mesh is given"
+    )
+    parser.add_argument(
+        "--mesh",
+        type=Path,
+        metavar="FILE",
+        help="the mesh at whose vertices the maps are. With --tensors, the tensors of this volume are interpolated at "
+        "the vertices in scanner coordinates, as in 'hks-jax hks'; with --array, the mesh's file has them",
+    )
+    options.add_vertices(parser)
+    options.add_reading(parser)
+    options.add_components(parser)
+    options.add_dtype(parser)
+    options.add_interpolation(parser)
+    options.add_output(parser)
+    parser.add_argument(
+        "--operator",
+        choices=("fick", "laplace-beltrami"),
+        default="fick",
+        help="fick: the diffusion of a substance by Fick's law (default), whose density becomes uniform in space. "
+        "laplace-beltrami: the heat flow of the metric D⁻¹, which keeps the integral with the volume of this metric",
+    )
+    parser.add_argument(
+        "--boundary",
+        type=boundary_conditions,
+        default="neumann",
+        metavar="CONDITION",
+        help="condition at the boundary of the domain: neumann (nothing flows through it, the default); dirichlet "
+        "(the map is 0 at the sides of the image, or at the boundary of a mesh); dirichlet-rim (also at the boundary "
+        "of a mask); or periodic. Give one condition for all axes, or one per axis",
+    )
+    options.add_view(parser)
 
 
 class _Place(NamedTuple):
@@ -133,7 +163,7 @@ def _on_grid(args: argparse.Namespace, progress: Progress) -> _Place:
 def _on_mesh(args: argparse.Namespace, progress: Progress) -> _Place:
     of_grids = ["slice", "view", "components"]
     if args.tensors is None:  # with --tensors, the options for reading refer to the volume
-        of_grids += [o.name for o in options_in(READING) if o.name not in ("order", "array")]
+        of_grids += [name for name in options.defaults(options.add_reading) if name not in ("order", "array")]
     refuse(args, of_grids, "this option is for tensors on a grid; leave it out for a mesh")
     check_boundary(args.boundary)
     found = domain_in(args.mesh, None if args.operator == "fick" else "inverse", args, progress)

@@ -22,14 +22,23 @@ from typing import Any
 import numpy as np
 
 from hks_jax import Eigenpairs, TensorField
+from hks_jax.cli import options
 from hks_jax.cli.computation import Settings, compute_pairs, describe_input, describe_pairs
-from hks_jax.cli.options import READING, SOLVING
 from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read_volume
 from hks_jax.eigen.weyl import weyl_count
 
-OPTIONS = f"@file @metric {READING} @output {SOLVING}"
+USAGE = "FILE -o OUT"
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    options.add_file(parser)
+    options.add_metric(parser)
+    options.add_reading(parser)
+    options.add_output(parser)
+    options.add_solving(parser)
 
 
 def writes(args: argparse.Namespace) -> list[Path]:

@@ -12,8 +12,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from hks_jax.cli import INPUT_ERRORS
-from hks_jax.cli.computation import ComputationError, Solved, compute_pairs
+from hks_jax.cli.computation import INPUT_ERRORS, ComputationError, Solved, compute_pairs
 from hks_jax.cli.noise import noise_of_volume, signature_of
 from hks_jax.cli.outputs import PictureError, draw_picture
 from hks_jax.cli.pairs import are_of, read_pairs, write_pairs
