@@ -84,7 +84,7 @@ def test_a_reversed_axis_shows(tmp_path, axis):
     mirrored = bundles(0.1) * np.outer(signs, signs)
     (question,) = questions(read_tensors(write(tmp_path / "t.nii.gz", mirrored, affine(0, flip=True))))
     # In an image with x reversed, the scanner's axes are the voxels' with x reversed.
-    wanted = 'along the world axes: try frame "world"' if axis == 0 else f"with the {'xyz'[axis]} axis reversed"
+    wanted = 'along the world axes: try frame="world"' if axis == 0 else f"with the {'xyz'[axis]} axis reversed"
     assert question.startswith(WRONG)
     assert wanted in question
 
@@ -96,7 +96,7 @@ def test_scanner_axes_in_an_oblique_image_show(tmp_path, degrees, flip):
     world = turn @ bundles(0.1) @ turn.T
     path = write(tmp_path / "t.nii.gz", world, affine(degrees, flip))
     (question,) = questions(read_tensors(path))
-    assert 'along the world axes: try frame "world"' in question
+    assert 'along the world axes: try frame="world"' in question
     told = read_tensors(path, frame="world")
     assert questions(told) == ()
     np.testing.assert_allclose(told.tensors, bundles(0.1), atol=1e-9)
@@ -167,7 +167,7 @@ def scan(tmp_path):
 def test_the_mirrored_tensors_of_dipy_are_noticed(scan, capsys):
     path = str(scan / "dipy.nii.gz")
     (question,) = questions(read_tensors(path))
-    assert 'along the fsl axes: try frame "fsl"' in question
+    assert 'along the fsl axes: try frame="fsl"' in question
     assert questions(read_tensors(path, frame="fsl")) == ()
     np.testing.assert_allclose(read_tensors(path, frame="fsl").tensors, bundles(), atol=2e-8)
     assert main(["convert", path, str(scan / "o.nii.gz"), "-q"]) == 0
@@ -185,7 +185,7 @@ def test_gradient_directions_along_other_axes(scan, tmp_path, capsys):
     np.testing.assert_allclose(right.tensors, bundles(), atol=2e-8)
     assert questions(right) == ()
     (question,) = questions(fit_dwi(*names, everywhere, bvec_frame="voxel"))
-    assert 'along the fsl axes: try bvec_frame "fsl"' in question
+    assert 'along the fsl axes: try bvec_frame="fsl"' in question
     np.savetxt(scan / "voxel", np.loadtxt(scan / "g") * [[-1], [1], [1]])
     np.testing.assert_allclose(
         fit_dwi(*names[:2], scan / "voxel", everywhere, bvec_frame="voxel").tensors, right.tensors, atol=1e-9
