@@ -18,7 +18,7 @@ from hks_jax.cli import options
 from hks_jax.cli.computation import describe_input
 from hks_jax.cli.outputs import Done
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import read
+from hks_jax.cli.reading import Reading, read
 from hks_jax.io import find_invalid, save_tensors
 from hks_jax.io.formats import WRITTEN
 from hks_jax.io.repair import describe_invalid
@@ -44,7 +44,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         raise ValueError(f"OUT: got {args.output}; expected a name that ends in {', '.join(WRITTEN)}")
     if args.output.is_dir():
         raise IsADirectoryError(f"OUT: got the folder {args.output}; expected a file")
-    volume = read(args, progress)
+    volume = read(Reading.of(args), progress)
     if (bad := find_invalid(volume)).any():
         progress.warn(f"{int(bad.sum())} tensors are {describe_invalid(volume, bad)}; written unchanged, see --repair")
     with progress.stage("writing", str(args.output)):

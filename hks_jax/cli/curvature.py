@@ -22,7 +22,7 @@ from hks_jax.cli.computation import Settings, describe_input, field_of
 from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import read_volume
+from hks_jax.cli.reading import Reading, read_volume
 from hks_jax.curvature import gaussian_curvature
 from hks_jax.io import Result
 from hks_jax.io.formats import WRITTEN, format_of
@@ -60,7 +60,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     from hks_jax.plot import hks_panels
     from hks_jax.plot.signature import cropped, placed
 
-    volume, settings, periodic = read_volume(args, progress), Settings.of(args), args.periodic or ""
+    volume, settings, periodic = read_volume(Reading.of(args), progress), Settings.of(args), args.periodic or ""
     refuse(args, ("operator",), "the curvature is that of a metric; pass --metric inverse for that of D⁻¹")
     if volume.dimension != 2:
         raise ValueError(

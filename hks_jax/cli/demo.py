@@ -63,7 +63,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
             volume = fit_dwi(brain.images, brain.bval, brain.bvec, brain.mask, b_max=B_MAX).slice("z", 0)
             volume = volume.with_mask(erode(volume.inside, RIM))
     settings = Settings.of(metric="inverse", components="largest", k=N_PAIRS, times=Times((), N_TIMES))
-    result = signature_of(args, compute_pairs(volume, settings, progress), None, progress)
+    result = signature_of(compute_pairs(volume, settings, progress), None, progress)
     title = (
         rf"$4\pi t\,$HKS of {'a phantom' if brain is None else 'a brain slice'}, metric D⁻¹. The value 1 means flat; "
         "larger values mean positive curvature"

@@ -167,7 +167,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
                 "Compute it by 'hks-jax hks' without --normalisation"
             )
         args.operator = args.operator or target.settings.get("operator", "laplace-beltrami")
-        require_one(args)
+        require_one(args.metric, args.operator)
         if target.normalisation == "flat":
             target = replace(target, values=target.values / target.to_flat)
         # The mask is the domain of the computed signature, so all of its components belong to the domain.

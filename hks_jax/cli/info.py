@@ -16,6 +16,7 @@ import argparse
 import json
 import math
 import shlex
+from collections.abc import Mapping
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from hks_jax.cli import options
 from hks_jax.cli.computation import times_in_words
 from hks_jax.cli.pairs import arrays_in
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import outside_note, read, without_element
+from hks_jax.cli.reading import Reading, outside_note, read, without_element
 from hks_jax.domain.components import label_nodes
 from hks_jax.domain.simplices import WORDS, signed_measure
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
@@ -64,7 +65,10 @@ def run(args: argparse.Namespace, progress: Progress) -> None:
         description = {"file": str(args.file), **describe_mesh(args.file, read_mesh(args.file, clean=args.clean))}
         description["arrays"] = listed(arrays_by_place(args.file, args.clean))
     else:
-        description = {**describe(args.file, read(args, progress, questions.append)), "questions": questions}
+        description = {
+            **describe(args.file, read(Reading.of(args), progress, questions.append)),
+            "questions": questions,
+        }
     print(json.dumps(description, indent=2, ensure_ascii=False) if args.json else "\n".join(_lines(description)))
 
 
@@ -167,7 +171,7 @@ def describe_mesh(path: Path, mesh: SimplicialMesh) -> dict[str, Any]:
     }
 
 
-def listed(arrays: dict[str, dict[str, np.ndarray]]) -> list[dict[str, Any]]:
+def listed(arrays: Mapping[str, Mapping[str, np.ndarray]]) -> list[dict[str, Any]]:
     """Return the names, places and numbers of components of a mesh's arrays."""
     return [
         {"name": name, "at": at, "components": math.prod(values.shape[1:])}

@@ -1,11 +1,11 @@
 """Read a mesh, with the metric that tensors give it, from the options of meshes, and compute its eigenpairs."""
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool
@@ -15,10 +15,8 @@ from hks_jax.cli.computation import Settings, solve, use_dtype
 from hks_jax.cli.info import listed
 from hks_jax.cli.options import add_reading, defaults, refuse
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import read, require_one
-from hks_jax.domain.tensor_checks import Interpolation, MetricChoice, OperatorChoice
+from hks_jax.cli.reading import Reading, read, require_one
 from hks_jax.fem.assembly import MESH_BOUNDARIES
-from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.io import TensorVolume, read_mask, read_mesh, sample_tensors
 from hks_jax.io.cortex import MAPS, structure_of
 from hks_jax.io.mesh import WRITTEN, arrays_by_place, is_surface
@@ -43,39 +41,45 @@ class Domain(NamedTuple):
     of_tensors: Callable[[Any], Mesh] | None
 
 
-def domain_of(args: argparse.Namespace, progress: Progress) -> Domain:
-    """Read the mesh, and the tensors that give it a metric, from the options; raise ValueError for other options."""
-    _check_options(args)
-    return domain_in(args.file, args.metric, args, progress)
+class MeshFile(NamedTuple):
+    """The file of a mesh and how to read it, with the names of the options; `around` has the tensors of a volume."""
+
+    file: Path
+    clean: bool
+    inside: Path | None
+    array: str | None
+    order: Order | None
+    around: Reading | None
+
+    @classmethod
+    def of(cls, args: argparse.Namespace, file: Path) -> "MeshFile":
+        """Return the options in `args`; raise ValueError for a boundary condition or options that meshes lack."""
+        of_grids = ["slice", "through", "view", "save_pairs", "components", "method"]
+        if not args.tensors:  # with --tensors, the options for reading refer to the volume
+            of_grids += [name for name in defaults(add_reading) if name not in ("order", "array")]
+        elif args.array:
+            raise ValueError("--tensors, --array: got both; expected tensors either in a volume or in the mesh's file")
+        refuse(args, of_grids, "this option is for tensors on a grid; leave it out for a mesh")
+        if args.boundary not in (None, *MESH_BOUNDARIES):
+            raise ValueError(f"--boundary: got {args.boundary!r}; expected {', '.join(MESH_BOUNDARIES)} for a mesh")
+        around = Reading.of(args, file=args.tensors, others=()) if args.tensors else None
+        return cls(file, args.clean, args.inside, args.array, args.order, around)
 
 
-def domain_in(file: Path, metric: MetricChoice | None, args: argparse.Namespace, progress: Progress) -> Domain:
-    """Read a mesh, and the tensors that give it the chosen metric, from the options."""
-    with progress.stage("reading", str(file)):
-        return _read_domain(
-            file,
-            _volume_around(args, progress),
-            progress,
-            dtype=args.dtype,
-            clean=args.clean,
-            inside=args.inside,
-            array=args.array,
-            order=args.order,
-            metric=metric,
-            operator=args.operator,
-            interpolation=args.interpolation,
+def require_mesh_options(args: argparse.Namespace) -> None:
+    """Raise ValueError for several files, and for options of tensors without tensors or without --metric."""
+    if args.others:
+        raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one mesh")
+    if not (args.array or args.tensors):
+        why = "this option needs tensors, but without --array and --tensors a mesh has the Euclidean metric"
+        refuse(args, OF_TENSORS, f"{why}. Pass --array or --tensors, or leave this option out")
+        refuse(args, ("noise",), NO_NOISE)
+    elif args.metric is None and args.operator != "fick":
+        raise ValueError(
+            "--metric: the tensors of the mesh need a metric. Choose inverse, tensor or adjugate, or pass "
+            "--operator fick"
         )
-
-
-def _volume_around(args: argparse.Namespace, progress: Progress) -> TensorVolume | None:
-    """Read the volume of ``--tensors``, if this option is given."""
-    if not args.tensors:
-        return None
-    if args.array:
-        raise ValueError("--tensors, --array: got both; expected tensors either in a volume or in the mesh's file")
-    volume = read(argparse.Namespace(**vars(args) | {"file": args.tensors, "others": []}), progress)
-    require_valid(volume, "--repair")
-    return volume
+    require_one(args.metric, args.operator)
 
 
 def solve_mesh(mesh: Mesh, settings: Settings, progress: Progress) -> tuple[Eigenpairs, Settings]:
@@ -98,57 +102,25 @@ def images_of_mesh(file: Path, mesh: Mesh, clean: bool) -> tuple[tuple[str, ...]
     return ((own, MAPS), structure_of(file)) if is_surface(file) and not clean else ((own,), {})
 
 
-def _check_options(args: argparse.Namespace) -> None:
-    """Raise ValueError for options that only grids have, and for tensors without --metric."""
-    if args.others:
-        raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one mesh")
-    of_grids = ["slice", "through", "view", "save_pairs", "components", "method"]
-    if not args.tensors:  # with --tensors, the options for reading refer to the volume
-        of_grids += [name for name in defaults(add_reading) if name not in (*OF_TENSORS, "array")]
-    refuse(args, of_grids, "this option is for tensors on a grid; leave it out for a mesh")
-    check_boundary(args.boundary)
-    if not (args.array or args.tensors):
-        why = "this option needs tensors, but without --array and --tensors a mesh has the Euclidean metric"
-        refuse(args, OF_TENSORS, f"{why}. Pass --array or --tensors, or leave this option out")
-        refuse(args, ("noise",), NO_NOISE)
-    elif args.metric is None and args.operator != "fick":
-        raise ValueError(
-            "--metric: the tensors of the mesh need a metric. Choose inverse, tensor or adjugate, or pass "
-            "--operator fick"
-        )
-    require_one(args)
-
-
-def check_boundary(boundary: BoundarySpec | None) -> None:
-    """Raise ValueError for a boundary condition that meshes do not have."""
-    if boundary not in (None, *MESH_BOUNDARIES):
-        raise ValueError(f"--boundary: got {boundary!r}; expected {', '.join(MESH_BOUNDARIES)} for a mesh")
-
-
-def _read_domain(
-    file: Path,
-    volume: TensorVolume | None,
-    progress: Progress,
-    *,
-    dtype: Literal["float32", "float64"],
-    clean: bool,
-    inside: Path | None,
-    array: str | None,
-    order: Order | None,
-    metric: MetricChoice | None,
-    operator: OperatorChoice,
-    interpolation: Interpolation,
-) -> Domain:
+def read_domain(source: MeshFile, settings: Settings, progress: Progress) -> Domain:
     """Read a mesh in the chosen precision, with the metric of tensors in a volume or in an array of its file, if any.
 
-    Without tensors, the mesh has the Euclidean metric. The arguments have the names of the options, except for the
-    volume of ``--tensors``.
+    Without tensors, the mesh has the Euclidean metric.
     """
-    use_dtype(dtype)
-    mesh = read_mesh(file, clean=clean, in_space=volume is not None)
+    with progress.stage("reading", str(source.file)):
+        volume = None if source.around is None else read(source.around, progress)
+        if volume is not None:
+            require_valid(volume, "--repair")
+        use_dtype(settings.dtype)
+        return _with_metric(source, volume, settings, progress)
+
+
+def _with_metric(source: MeshFile, volume: TensorVolume | None, settings: Settings, progress: Progress) -> Domain:
+    file, dtype = source.file, settings.dtype
+    mesh = read_mesh(file, clean=source.clean, in_space=volume is not None)
     vertices, cells = np.asarray(mesh.vertices).astype(dtype), mesh.triangulation.cells
     kind: Any = type(mesh)
-    mask = None if inside is None else _inside(inside, len(vertices))
+    mask = None if source.inside is None else _inside(source.inside, len(vertices))
     if mask is not None:
         try:
             kind(vertices, cells, mask=mask)
@@ -156,8 +128,8 @@ def _read_domain(
             raise ValueError(f"--inside: {str(error).removeprefix('mask: ')}") from error
 
     def domain(tensors: Any, at: str = "vertices") -> Mesh:
-        settings: Any = {"at": at, "interpolation": interpolation, "mask": mask}
-        made: Mesh = kind.from_tensors(vertices, cells, tensors, metric, operator=operator, **settings)
+        how: Any = {"at": at, "operator": settings.operator, "interpolation": settings.interpolation, "mask": mask}
+        made: Mesh = kind.from_tensors(vertices, cells, tensors, settings.metric, **how)
         return made
 
     if volume is not None:
@@ -176,30 +148,41 @@ def _read_domain(
             return domain(tensors)
 
         return Domain(sampled(volume.tensors), volume.tensors, volume, sampled)
-    arrays = arrays_by_place(file, clean)
-    if not array:
-        for each in (each for each in listed(arrays) if each["components"] in (6, 9)):
-            progress.note(
-                f"the {each['components']} components of {each['name']} at the {each['at']} are not used, and the mesh "
-                f"has the Euclidean metric. To use them, pass --array {each['name']}"
-                + " and --order"
-                * (each["components"] == 6)
-            )
+    arrays = arrays_by_place(file, source.clean)
+    if source.array is None:
+        _tell_of_tensors(arrays, progress)
         return Domain(kind(vertices, cells, mask=mask), None, None, None)
-    places = [at for at, there in arrays.items() if array in there]
+    tensors, place = _tensors_in(arrays, source.array, source.order, progress)
+    tensors, of_tensors = tensors.astype(dtype), partial(domain, at=place)
+    return Domain(of_tensors(tensors), tensors, None, of_tensors)
+
+
+def _tell_of_tensors(arrays: Mapping[str, Mapping[str, np.ndarray]], progress: Progress) -> None:
+    """Print a note about arrays that may be tensors."""
+    for each in (each for each in listed(arrays) if each["components"] in (6, 9)):
+        progress.note(
+            f"the {each['components']} components of {each['name']} at the {each['at']} are not used, and the mesh "
+            f"has the Euclidean metric. To use them, pass --array {each['name']}"
+            + " and --order"
+            * (each["components"] == 6)
+        )
+
+
+def _tensors_in(
+    arrays: Mapping[str, Mapping[str, np.ndarray]], name: str, order: Order | None, progress: Progress
+) -> tuple[np.ndarray, str]:
+    """Return the tensors in an array of a mesh, and their place, vertices or cells."""
+    places = [at for at, there in arrays.items() if name in there]
     if not places:
         there = "; ".join(f"at the {at}: {', '.join(named) or 'none'}" for at, named in arrays.items())
-        raise ValueError(f"--array: got {array!r}; expected one of the arrays {there}")
+        raise ValueError(f"--array: got {name!r}; expected one of the arrays {there}")
     if len(places) > 1:
-        progress.note(f"--array: {array} is at the {' and at the '.join(places)}; the {places[0]} are used")
-    values = arrays[places[0]][array]
+        progress.note(f"--array: {name} is at the {' and at the '.join(places)}; the {places[0]} are used")
+    values = arrays[places[0]][name]
     values = values.reshape(len(values), -1)
     if values.shape[1] != (9 if order is None else 6):
-        n = values.shape[1]
-        raise ValueError(f"--array: got {array!r} with {n} components; expected 9, or 6 with --order")
-    tensors = matrices(array, values, order).tensors.astype(dtype)
-    of_tensors = partial(domain, at=places[0])
-    return Domain(of_tensors(tensors), tensors, None, of_tensors)
+        raise ValueError(f"--array: got {name!r} with {values.shape[1]} components; expected 9, or 6 with --order")
+    return matrices(name, values, order).tensors, places[0]
 
 
 def _inside(path: Path, n_vertices: int) -> Bool[np.ndarray, " V"]:

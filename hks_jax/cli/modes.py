@@ -33,18 +33,16 @@ import numpy as np
 
 from hks_jax import Eigenpairs, ModeEnergies, energy, reconstruct
 from hks_jax.cli import options
-from hks_jax.cli import pairs as saved_pairs
 from hks_jax.cli.computation import Settings, compute_pairs, describe_input, describe_pairs
+from hks_jax.cli.grids import tensors_of
 from hks_jax.cli.info import describe_mesh
-from hks_jax.cli.meshes import domain_of, images_of_mesh, solve_mesh
-from hks_jax.cli.options import refuse
+from hks_jax.cli.meshes import MeshFile, images_of_mesh, read_domain, require_mesh_options, solve_mesh
 from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import read_volume, require_metric
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.io import TensorVolume, read_maps, save
 from hks_jax.io.cortex import MAPS
-from hks_jax.io.formats import WRITTEN, format_of
+from hks_jax.io.formats import WRITTEN
 from hks_jax.io.mesh import WRITTEN as MESHES_WRITTEN
 from hks_jax.io.mesh import is_mesh, is_surface
 from hks_jax.io.tables import write_json, write_table
@@ -143,24 +141,18 @@ _SETTINGS = ("metric", "operator", "interpolation", "boundary", "components", "s
 
 
 def _on_grid(args: argparse.Namespace, progress: Progress) -> _Solved:
-    refuse(args, ("clean", "inside"), "this option is for meshes; for tensors on a grid, see --repair and --mask")
-    refuse(args, ("tensors",), "this option is for a mesh inside a volume; leave it out for the volume itself")
     settings = Settings.of(args, boundary=args.boundary or "neumann")
-    if not args.others and saved_pairs.is_saved_pairs(args.file):
-        settled = options.defaults(options.add_metric, options.add_reading, options.add_solving)
-        refuse(args, settled, f"the eigenpairs in {args.file} determine this setting; leave the option out")
-        solved, image = saved_pairs.read_pairs(args.file, settings, progress)
-    else:
-        require_metric(args)
-        volume, image = read_volume(args, progress), format_of(args.file).image
-        solved = compute_pairs(volume, settings, progress)
+    volume, image, saved = tensors_of(args, settings, progress)
+    solved = compute_pairs(volume, settings, progress) if saved is None else saved
     volume = solved.volume
     return _Solved(volume, solved.pairs, solved.settings, (image,), {}, volume.length_unit, describe_input(volume))
 
 
 def _on_mesh(args: argparse.Namespace, progress: Progress) -> _Solved:
-    mesh = domain_of(args, progress).mesh
-    pairs, settings = solve_mesh(mesh, Settings.of(args, metric=args.metric), progress)
+    require_mesh_options(args)
+    settings = Settings.of(args, metric=args.metric)
+    mesh = read_domain(MeshFile.of(args, args.file), settings, progress).mesh
+    pairs, settings = solve_mesh(mesh, settings, progress)
     about = {"source": str(args.file), **describe_mesh(args.file, mesh)}
     images, origin = images_of_mesh(args.file, mesh, args.clean)
     return _Solved(mesh, pairs, settings, images, origin, "mm" * is_surface(args.file), about)

@@ -34,12 +34,12 @@ from hks_jax import SurfaceMesh, TensorField, gaussian_scale_space
 from hks_jax.cli import options
 from hks_jax.cli.computation import Settings, describe_input, field_of
 from hks_jax.cli.info import describe_mesh
-from hks_jax.cli.meshes import Domain, check_boundary, domain_in, images_of_mesh
+from hks_jax.cli.meshes import Domain, MeshFile, images_of_mesh, read_domain
 from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.parsing import boundary_conditions
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import read_volume
+from hks_jax.cli.reading import Reading, read_volume
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.fem.boundary import unreached_sides
 from hks_jax.io import TensorVolume, read_maps, save
@@ -150,9 +150,8 @@ def _on_grid(args: argparse.Namespace, progress: Progress) -> _Place:
         )
     refuse(args, ("clean", "inside"), "this option is for meshes; for tensors on a grid, see --repair and --mask")
     metric = None if args.operator == "fick" else "inverse"
-    of_tensors = argparse.Namespace(**vars(args) | {"file": args.tensors, "metric": metric})
-    volume = read_volume(of_tensors, progress)
-    field = field_of(volume, volume.grid(args.components), Settings.of(of_tensors, metric=metric))
+    volume = read_volume(Reading.of(args, file=args.tensors, metric=metric), progress)
+    field = field_of(volume, volume.grid(args.components), Settings.of(args, metric=metric))
     for message in unreached_sides(field.grid.inside, args.boundary):
         progress.warn(message)
     volume = volume.with_mask(field.grid.mask)
@@ -161,12 +160,8 @@ def _on_grid(args: argparse.Namespace, progress: Progress) -> _Place:
 
 
 def _on_mesh(args: argparse.Namespace, progress: Progress) -> _Place:
-    of_grids = ["slice", "view", "components"]
-    if args.tensors is None:  # with --tensors, the options for reading refer to the volume
-        of_grids += [name for name in options.defaults(options.add_reading) if name not in ("order", "array")]
-    refuse(args, of_grids, "this option is for tensors on a grid; leave it out for a mesh")
-    check_boundary(args.boundary)
-    found = domain_in(args.mesh, None if args.operator == "fick" else "inverse", args, progress)
+    metric = None if args.operator == "fick" else "inverse"
+    found = read_domain(MeshFile.of(args, args.mesh), Settings.of(args, metric=metric), progress)
     mesh = found.mesh
     (images, origin), about = images_of_mesh(args.mesh, mesh, args.clean), describe_mesh(args.mesh, mesh)
     about |= {"source": str(args.mesh), "tensors": None if args.tensors is None else str(args.tensors)}

@@ -26,7 +26,7 @@ from hks_jax.cli import options
 from hks_jax.cli.computation import Settings, compute_pairs, describe_input, describe_pairs
 from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import read_volume
+from hks_jax.cli.reading import Reading, read_volume
 from hks_jax.eigen.weyl import weyl_count
 
 USAGE = "FILE -o OUT"
@@ -48,7 +48,7 @@ def writes(args: argparse.Namespace) -> list[Path]:
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
-    volume = read_volume(args, progress)
+    volume = read_volume(Reading.of(args), progress)
     settings = Settings.of(args, boundary=args.boundary or "neumann")
     solved = compute_pairs(volume, settings, progress)
     field, pairs = solved.field, solved.pairs

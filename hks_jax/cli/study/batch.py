@@ -44,12 +44,12 @@ from hks_jax.cli import options
 from hks_jax.cli.computation import ComputationError, Settings
 from hks_jax.cli.info import describe
 from hks_jax.cli.inputs import require_inputs_kept
-from hks_jax.cli.noise import check_noise, second_scan
+from hks_jax.cli.noise import check_noise
 from hks_jax.cli.options import FILES, defaults, flag, refuse
 from hks_jax.cli.outputs import Done, show
 from hks_jax.cli.parsing import Times, folder
 from hks_jax.cli.progress import Progress, StudyProgress
-from hks_jax.cli.reading import read_volume, require_metric
+from hks_jax.cli.reading import Reading, is_file, read_volume, require_metric
 from hks_jax.cli.study.folder import DESCRIPTIONS, MAP, PAIRS, REGIONS, Study, reading_options
 from hks_jax.cli.study.subjects import Subject, read_subjects
 from hks_jax.io import TensorVolume
@@ -116,7 +116,7 @@ def run(args: argparse.Namespace, begun: Progress) -> None:
     """Run the command; if some subjects fail, raise ComputationError after computing the others."""
     from hks_jax.cli.study.tasks import run_all
 
-    if second_scan(args) is not None:
+    if is_file(args.noise):
         why = "for all subjects; expected a number, residuals or roughness"
         raise ValueError(f"--noise: got {args.noise} {why}. Put second scans into a column named noise of the table")
     args.strict_unit = True
@@ -126,7 +126,7 @@ def run(args: argparse.Namespace, begun: Progress) -> None:
     for subject in chosen:
         if subject.arguments is not None:
             require_inputs_kept(subject.arguments)
-            require_metric(subject.arguments)
+            require_metric(Reading.of(subject.arguments))
             check_noise(subject.arguments)
     if not any(s.arguments is not None and s.arguments.atlas is not None for s in subjects):
         refuse(args, ("names",), "this option names labels, which are missing; pass --atlas, or a column named atlas")
@@ -264,7 +264,7 @@ def _suitable(
     for number, subject in enumerate(subjects, 1):
         progress.update(f"choosing times: {subject.name}, {number} of {len(subjects)}")
         try:
-            ranges[subject.name] = suitable_range(read_volume(subject.args, silent), subject.args)
+            ranges[subject.name] = suitable_range(read_volume(Reading.of(subject.args), silent), subject.args)
         except Exception as error:  # reported when the subject is computed
             first = first or f"{subject.name}: {error}"
     if not ranges:

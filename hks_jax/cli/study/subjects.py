@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NoReturn
 
-from hks_jax.cli.noise import second_scan
 from hks_jax.cli.options import COLUMNS, FILES, add_atlas, add_file, add_names, add_noise, add_reading
+from hks_jax.cli.reading import is_file
 from hks_jax.io.tables import read_table
 
 
@@ -77,7 +77,7 @@ def read_subjects(path: Path, common: argparse.Namespace) -> list[Subject]:
             if not words or words[0].startswith("--"):
                 raise ValueError("got no file; expected a file in every row")
             arguments, problem = parser.parse_args(words, copy.copy(common)), ""
-            if second_scan(arguments) is not None:
+            if is_file(arguments.noise):
                 arguments.noise = str(path.parent / arguments.noise)
         except ValueError as error:
             arguments, problem = None, str(error)
