@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from hks_jax.cli import options
-from hks_jax.cli.computation import Settings, describe_input, field_of
+from hks_jax.cli.computation import Settings, domain_of_volume
 from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.progress import Progress
@@ -67,8 +67,9 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
             f"--slice: got tensors on a volume of shape {volume.shape}; expected two dimensions for the Gaussian "
             "curvature. Choose a slice, such as --slice z=14"
         )
-    field = field_of(volume, volume.grid(args.components), settings)
-    volume, inside = volume.with_mask(field.grid.mask), field.grid.inside
+    domain = domain_of_volume(volume, settings)
+    volume, field = domain.place, domain.field
+    inside = field.grid.inside
     with progress.stage("curvature", f"{int(inside.sum())} nodes"):
         curvature = np.asarray(gaussian_curvature(field, ["x" in periodic, "y" in periodic]))
     known = np.isfinite(curvature)
@@ -79,7 +80,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     density = np.sqrt(np.linalg.det(np.asarray(field.domain_tensors, np.float64)))[known]
     values = curvature[known].astype(np.float64)
     report = {
-        "input": describe_input(volume),
+        "input": domain.about,
         "settings": {"metric": settings.metric, "periodic": periodic, "dtype": settings.dtype},
         "curvature": {
             "nodes": int(known.sum()),

@@ -14,7 +14,7 @@ import importlib.util
 from functools import partial
 
 from hks_jax.cli import options
-from hks_jax.cli.computation import Settings, compute_pairs
+from hks_jax.cli.computation import Settings, compute_pairs, domain_of_volume
 from hks_jax.cli.noise import signature_of
 from hks_jax.cli.outputs import Done, write_outputs
 from hks_jax.cli.parsing import Times, folder
@@ -63,7 +63,8 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
             volume = fit_dwi(brain.images, brain.bval, brain.bvec, brain.mask, b_max=B_MAX).slice("z", 0)
             volume = volume.with_mask(erode(volume.inside, RIM))
     settings = Settings.of(metric="inverse", components="largest", k=N_PAIRS, times=Times((), N_TIMES))
-    result = signature_of(compute_pairs(volume, settings, progress), None, progress)
+    solved = compute_pairs(domain_of_volume(volume, settings), settings, progress)
+    result = signature_of(solved, None, progress)
     title = (
         rf"$4\pi t\,$HKS of {'a phantom' if brain is None else 'a brain slice'}, metric D⁻¹. The value 1 means flat; "
         "larger values mean positive curvature"

@@ -28,28 +28,18 @@ from pathlib import Path
 
 import numpy as np
 
-from hks_jax import SurfaceMesh, TensorNoise, TetMesh
+from hks_jax import SurfaceMesh, TetMesh
 from hks_jax.cli import options
-from hks_jax.cli import pairs as saved_pairs
-from hks_jax.cli.computation import Settings, Solved, compute_pairs, result_of, use_dtype
-from hks_jax.cli.grids import tensors_of
-from hks_jax.cli.info import describe_mesh
-from hks_jax.cli.meshes import (
-    Domain,
-    Mesh,
-    MeshFile,
-    images_of_mesh,
-    read_domain,
-    require_mesh_options,
-    solve_mesh,
-)
-from hks_jax.cli.noise import Noise, Noisy, check_noise, noise_of_volume, signature_of, with_error_bars
+from hks_jax.cli.computation import compute_pairs
+from hks_jax.cli.noise import check_noise, noise_of, signature_of
 from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import PAIRS, REPORT, Done, of_earlier, write_outputs
+from hks_jax.cli.pairs import write_pairs
 from hks_jax.cli.parsing import voxel
+from hks_jax.cli.problem import read_problem
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import Reading
-from hks_jax.io.mesh import is_mesh
+from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result
 
 USAGE = "FILE -o OUT"
@@ -89,75 +79,24 @@ def writes(args: argparse.Namespace) -> list[Path]:
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
     check_noise(args)
-    if is_mesh(args.file):
-        require_mesh_options(args)
-        source, settings = MeshFile.of(args, args.file), Settings.of(args, metric=args.metric)
-        mesh, result = _on_mesh(source, settings, args.noise, args.draws, progress)
-        images, origin = images_of_mesh(args.file, mesh, args.clean)
-        return write_outputs(
-            args.output, result, progress, partial(_draw_mesh, result, args.show_rim), *images, origin=origin
-        )
+    domain, settings, solved = read_problem(args, progress)
+    if isinstance(domain.place, TensorVolume) and domain.place.dimension == 2:
+        refuse(args, ("through",), "this option is for a volume; leave it out for a slice")
+    noise = noise_of(domain, Reading.of(args), args.draws, progress)  # before the eigenpairs, because it may fail
+    solved = solved or compute_pairs(domain, settings, progress)
+    kept = [args.output / PAIRS] * args.save_pairs
+    for path in kept:  # the eigenpairs are written first, because later steps may fail
+        with progress.stage("writing", str(path)):
+            for file in of_earlier(args.output, np.asarray(solved.pairs.eigenvalues), progress):
+                file.unlink(missing_ok=True)
+            write_pairs(path, solved, progress.warnings)
+    result = signature_of(solved, noise, progress)
     from hks_jax.plot import signature_panels
 
-    settings = Settings.of(args)
-    volume, image, solved = tensors_of(args, settings, progress)
-    if volume.dimension == 2:
-        refuse(args, ("through",), "this option is for a volume; leave it out for a slice")
-    noise = None
-    if solved is None:
-        if args.noise is not None:  # the noise is read first, because reading it may fail
-            use_dtype(args.dtype)
-            noise = noise_of_volume(Reading.of(args), args.draws, volume, volume.grid(args.components), progress)
-        solved = compute_pairs(volume, settings, progress)
-    kept = []
-    if args.save_pairs:  # the eigenpairs are written first, because later steps may fail
-        kept = [args.output / PAIRS]
-        _save_pairs(kept[0], solved, image, progress)
-    result = signature_of(solved, noise, progress)
-    style = {"view": args.view, "through": args.through, "show_rim": args.show_rim}
-    done = write_outputs(args.output, result, progress, partial(signature_panels, result, **style), image)
+    panels = partial(signature_panels, result, view=args.view, through=args.through, show_rim=args.show_rim)
+    draw = panels if isinstance(domain.place, TensorVolume) else partial(_draw_mesh, result, args.show_rim)
+    done = write_outputs(args.output, result, progress, draw, *domain.images, origin=domain.origin)
     return done._replace(files=[*done.files, *kept])
-
-
-def _save_pairs(path: Path, solved: Solved, image: str, progress: Progress) -> None:
-    """Write eigenpairs, and remove the files of an earlier signature in their folder."""
-    with progress.stage("writing", str(path)):
-        for file in of_earlier(path.parent, np.asarray(solved.pairs.eigenvalues), progress):
-            file.unlink(missing_ok=True)
-        saved_pairs.write_pairs(path, solved, image, progress.warnings)
-
-
-def _on_mesh(
-    source: MeshFile, settings: Settings, noise: str | None, draws: int, progress: Progress
-) -> tuple[Mesh, Result]:
-    """Compute the signature on a mesh, with error bars if `noise` asks for them."""
-    domain = read_domain(source, settings, progress)
-    noisy = None if noise is None else _noise_on(domain, source.around, noise, draws, progress)
-    pairs, settings = solve_mesh(domain.mesh, settings, progress)
-    described = {"source": str(source.file), **describe_mesh(source.file, domain.mesh)}
-    of_pairs = partial(result_of, domain.mesh, described, pairs)
-    if noisy is None:
-        return domain.mesh, of_pairs(settings, progress)
-    return domain.mesh, with_error_bars(of_pairs, noisy, pairs, settings, progress)
-
-
-def _noise_on(domain: Domain, around: Reading | None, noise: str, draws: int, progress: Progress) -> Noisy:
-    """Return the tensors of a mesh and their noise."""
-    assert domain.tensors is not None
-    assert domain.of_tensors is not None
-    if around is not None:
-        assert domain.volume is not None
-        found = noise_of_volume(around, draws, domain.volume, domain.volume.grid("all"), progress)
-        assert found is not None
-        return Noisy(domain.tensors, found, domain.of_tensors, traceable=False)
-    try:
-        level = float(noise)
-    except ValueError:
-        raise ValueError(
-            f"--noise: got {noise!r}; expected a number, relative to the mean diffusivity, for tensors of a mesh"
-        ) from None
-    relative = Noise(TensorNoise.relative(domain.tensors, level), noise, draws)
-    return Noisy(domain.tensors, relative, domain.of_tensors)
 
 
 def _draw_mesh(result: Result, show_rim: bool, path: Path) -> None:

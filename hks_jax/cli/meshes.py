@@ -1,18 +1,18 @@
 """Read a mesh, with the metric that tensors give it, from the options of meshes, and compute its eigenpairs."""
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool
 
-from hks_jax import Eigenpairs, SurfaceMesh, TetMesh, assemble
-from hks_jax.cli.computation import Settings, solve, use_dtype
-from hks_jax.cli.info import listed
+from hks_jax import TetMesh
+from hks_jax.cli.computation import Domain, Mesh, OfMesh, Settings, use_dtype
+from hks_jax.cli.info import describe_mesh, listed
 from hks_jax.cli.options import add_reading, defaults, refuse
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import Reading, read, require_one
@@ -25,20 +25,9 @@ from hks_jax.io.sampling import OutsideMaskError
 from hks_jax.io.tensor_order import Order, matrices
 from hks_jax.optional import optional
 
-Mesh: TypeAlias = SurfaceMesh | TetMesh
-
 OF_TENSORS = ("metric", "operator", "order", "interpolation")
 """Options that refer to tensors of a mesh."""
 NO_NOISE = "this option needs tensors; saved eigenpairs and meshes with the Euclidean metric have none. Leave it out"
-
-
-class Domain(NamedTuple):
-    """A mesh with a metric, the tensors behind the metric, and the function from such tensors to the mesh."""
-
-    mesh: Mesh
-    tensors: np.ndarray | None  # at the vertices or cells of the mesh, or at the voxels of the volume
-    volume: TensorVolume | None
-    of_tensors: Callable[[Any], Mesh] | None
 
 
 class MeshFile(NamedTuple):
@@ -82,16 +71,7 @@ def require_mesh_options(args: argparse.Namespace) -> None:
     require_one(args.metric, args.operator)
 
 
-def solve_mesh(mesh: Mesh, settings: Settings, progress: Progress) -> tuple[Eigenpairs, Settings]:
-    """Compute the eigenpairs of a mesh; return them, and the settings with the boundary condition."""
-    settings = replace(settings, boundary=settings.boundary or "neumann")
-    assert settings.boundary is not None
-    with progress.stage("assembly", f"{len(mesh.vertices)} vertices"):
-        pencil = assemble(mesh, settings.boundary)
-    return solve(pencil, settings, progress), settings
-
-
-def images_of_mesh(file: Path, mesh: Mesh, clean: bool) -> tuple[tuple[str, ...], dict[str, str]]:
+def _images(file: Path, mesh: Mesh, clean: bool) -> tuple[tuple[str, ...], dict[str, str]]:
     """Return the suffixes of results on a mesh, and entries for their provenance.
 
     The suffixes are that of the mesh's file, or .vtu if its format has no values at vertices; and for a GIFTI or a
@@ -102,7 +82,7 @@ def images_of_mesh(file: Path, mesh: Mesh, clean: bool) -> tuple[tuple[str, ...]
     return ((own, MAPS), structure_of(file)) if is_surface(file) and not clean else ((own,), {})
 
 
-def read_domain(source: MeshFile, settings: Settings, progress: Progress) -> Domain:
+def read_domain(source: MeshFile, settings: Settings, progress: Progress) -> OfMesh:
     """Read a mesh in the chosen precision, with the metric of tensors in a volume or in an array of its file, if any.
 
     Without tensors, the mesh has the Euclidean metric.
@@ -115,7 +95,7 @@ def read_domain(source: MeshFile, settings: Settings, progress: Progress) -> Dom
         return _with_metric(source, volume, settings, progress)
 
 
-def _with_metric(source: MeshFile, volume: TensorVolume | None, settings: Settings, progress: Progress) -> Domain:
+def _with_metric(source: MeshFile, volume: TensorVolume | None, settings: Settings, progress: Progress) -> OfMesh:
     file, dtype = source.file, settings.dtype
     mesh = read_mesh(file, clean=source.clean, in_space=volume is not None)
     vertices, cells = np.asarray(mesh.vertices).astype(dtype), mesh.triangulation.cells
@@ -127,10 +107,14 @@ def _with_metric(source: MeshFile, volume: TensorVolume | None, settings: Settin
         except ValueError as error:
             raise ValueError(f"--inside: {str(error).removeprefix('mask: ')}") from error
 
-    def domain(tensors: Any, at: str = "vertices") -> Mesh:
+    def of_tensors(tensors: Any, at: str = "vertices") -> Mesh:
         how: Any = {"at": at, "operator": settings.operator, "interpolation": settings.interpolation, "mask": mask}
-        made: Mesh = kind.from_tensors(vertices, cells, tensors, settings.metric, **how)
-        return made
+        with_metric: Mesh = kind.from_tensors(vertices, cells, tensors, settings.metric, **how)
+        return with_metric
+
+    def made(mesh: Mesh, *tensors: Any) -> OfMesh:
+        images, origin = _images(file, mesh, source.clean)
+        return Domain(mesh, mesh, {"source": str(file), **describe_mesh(file, mesh)}, images, origin, *tensors)
 
     if volume is not None:
         at = np.arange(len(vertices)) if mask is None else np.flatnonzero(mask)
@@ -145,16 +129,15 @@ def _with_metric(source: MeshFile, volume: TensorVolume | None, settings: Settin
                     "Pass a larger --mask, or pass --inside with the vertices inside the mask, to leave the others out"
                 )
                 raise ValueError(f"{error.fact}. {remedy}") from error
-            return domain(tensors)
+            return of_tensors(tensors)
 
-        return Domain(sampled(volume.tensors), volume.tensors, volume, sampled)
+        return made(sampled(volume.tensors), volume.tensors, sampled, volume)
     arrays = arrays_by_place(file, source.clean)
     if source.array is None:
         _tell_of_tensors(arrays, progress)
-        return Domain(kind(vertices, cells, mask=mask), None, None, None)
+        return made(kind(vertices, cells, mask=mask))
     tensors, place = _tensors_in(arrays, source.array, source.order, progress)
-    tensors, of_tensors = tensors.astype(dtype), partial(domain, at=place)
-    return Domain(of_tensors(tensors), tensors, None, of_tensors)
+    return made(of_tensors(tensors.astype(dtype), place), tensors.astype(dtype), partial(of_tensors, at=place))
 
 
 def _tell_of_tensors(arrays: Mapping[str, Mapping[str, np.ndarray]], progress: Progress) -> None:
