@@ -4,7 +4,6 @@ import argparse
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
-from types import MappingProxyType
 from typing import Any, Generic, Literal, NamedTuple, TypeAlias, TypeVar
 
 import jax
@@ -97,7 +96,7 @@ class Domain(Generic[Place, Field]):
     field: Field
     about: dict[str, Any]
     images: tuple[str, ...]
-    origin: Mapping[str, str] = MappingProxyType({})
+    origin: Mapping[str, str]
     tensors: np.ndarray | None = None
     of_tensors: Callable[[Any], Any] | None = None
     volume: TensorVolume | None = None
