@@ -38,7 +38,7 @@ from hks_jax.cli.pairs import write_pairs
 from hks_jax.cli.parsing import voxel
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import Reading
-from hks_jax.cli.task import read_task
+from hks_jax.cli.source import read_source
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result
 
@@ -79,7 +79,7 @@ def writes(args: argparse.Namespace) -> list[Path]:
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
     check_noise(args)
-    domain, settings, solved = read_task(args, progress)
+    domain, settings, solved = read_source(args, progress)
     if isinstance(domain.place, TensorVolume) and domain.place.dimension == 2:
         refuse(args, ("through",), "this option is for a volume; leave it out for a slice")
     noise = noise_of(domain, Reading.of(args), args.draws, progress)  # before the eigenpairs, because it may fail

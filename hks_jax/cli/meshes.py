@@ -1,4 +1,4 @@
-"""Read a mesh, with the metric that tensors give it, from the options of meshes, and compute its eigenpairs."""
+"""Read a mesh, with the metric that tensors give it, from the options of meshes."""
 
 import argparse
 from collections.abc import Mapping
@@ -82,25 +82,25 @@ def _images(file: Path, mesh: Mesh, clean: bool) -> tuple[tuple[str, ...], dict[
     return ((own, MAPS), structure_of(file)) if is_surface(file) and not clean else ((own,), {})
 
 
-def read_domain(source: MeshFile, settings: Settings, progress: Progress) -> OfMesh:
+def read_domain(mesh_file: MeshFile, settings: Settings, progress: Progress) -> OfMesh:
     """Read a mesh in the chosen precision, with the metric of tensors in a volume or in an array of its file, if any.
 
     Without tensors, the mesh has the Euclidean metric.
     """
-    with progress.stage("reading", str(source.file)):
-        volume = None if source.around is None else read(source.around, progress)
+    with progress.stage("reading", str(mesh_file.file)):
+        volume = None if mesh_file.around is None else read(mesh_file.around, progress)
         if volume is not None:
             require_valid(volume, "--repair")
         use_dtype(settings.dtype)
-        return _with_metric(source, volume, settings, progress)
+        return _with_metric(mesh_file, volume, settings, progress)
 
 
-def _with_metric(source: MeshFile, volume: TensorVolume | None, settings: Settings, progress: Progress) -> OfMesh:
-    file, dtype = source.file, settings.dtype
-    mesh = read_mesh(file, clean=source.clean, in_space=volume is not None)
+def _with_metric(mesh_file: MeshFile, volume: TensorVolume | None, settings: Settings, progress: Progress) -> OfMesh:
+    file, dtype = mesh_file.file, settings.dtype
+    mesh = read_mesh(file, clean=mesh_file.clean, in_space=volume is not None)
     vertices, cells = np.asarray(mesh.vertices).astype(dtype), mesh.triangulation.cells
     kind: Any = type(mesh)
-    mask = None if source.inside is None else _inside(source.inside, len(vertices))
+    mask = None if mesh_file.inside is None else _inside(mesh_file.inside, len(vertices))
     if mask is not None:
         try:
             kind(vertices, cells, mask=mask)
@@ -113,7 +113,7 @@ def _with_metric(source: MeshFile, volume: TensorVolume | None, settings: Settin
         return with_metric
 
     def made(mesh: Mesh, *tensors: Any) -> OfMesh:
-        images, origin = _images(file, mesh, source.clean)
+        images, origin = _images(file, mesh, mesh_file.clean)
         return Domain(mesh, mesh, {"source": str(file), **describe_mesh(file, mesh)}, images, origin, *tensors)
 
     if volume is not None:
@@ -132,11 +132,11 @@ def _with_metric(source: MeshFile, volume: TensorVolume | None, settings: Settin
             return of_tensors(tensors)
 
         return made(sampled(volume.tensors), volume.tensors, sampled, volume)
-    arrays = arrays_by_place(file, source.clean)
-    if source.array is None:
+    arrays = arrays_by_place(file, mesh_file.clean)
+    if mesh_file.array is None:
         _tell_of_tensors(arrays, progress)
         return made(kind(vertices, cells, mask=mask))
-    tensors, place = _tensors_in(arrays, source.array, source.order, progress)
+    tensors, place = _tensors_in(arrays, mesh_file.array, mesh_file.order, progress)
     return made(of_tensors(tensors.astype(dtype), place), tensors.astype(dtype), partial(of_tensors, at=place))
 
 

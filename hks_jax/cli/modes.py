@@ -36,7 +36,7 @@ from hks_jax.cli import options
 from hks_jax.cli.computation import OfMesh, OfVolume, compute_pairs, describe_pairs
 from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.task import read_task
+from hks_jax.cli.source import read_source
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.io import TensorVolume, read_maps, save
 from hks_jax.io.cortex import MAPS
@@ -80,7 +80,7 @@ def writes(args: argparse.Namespace) -> list[Path]:
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
-    domain, settings, saved = read_task(args, progress, "neumann")
+    domain, settings, saved = read_source(args, progress, "neumann")
     solved = saved or compute_pairs(domain, settings, progress)
     place, pairs, maps = domain.place, solved.pairs, None
     unit = place.length_unit if isinstance(place, TensorVolume) else "mm" * is_surface(args.file)

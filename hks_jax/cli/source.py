@@ -14,7 +14,7 @@ from hks_jax.io.formats import format_of
 from hks_jax.io.mesh import is_mesh
 
 
-class Task(NamedTuple):
+class Source(NamedTuple):
     """A domain, the settings, and the eigenpairs if the file has them."""
 
     domain: OfVolume | OfMesh
@@ -22,7 +22,7 @@ class Task(NamedTuple):
     saved: Solved | None = None
 
 
-def read_task(args: argparse.Namespace, progress: Progress, boundary: BoundarySpec | None = None) -> Task:
+def read_source(args: argparse.Namespace, progress: Progress, boundary: BoundarySpec | None = None) -> Source:
     """Read a mesh, the tensors of a volume, or saved eigenpairs; raise ValueError for options that do not fit.
 
     Without the option ``--boundary``, the condition is `boundary`.
@@ -32,7 +32,7 @@ def read_task(args: argparse.Namespace, progress: Progress, boundary: BoundarySp
     if is_mesh(args.file):
         require_mesh_options(args)
         settings = Settings.of(args, metric=args.metric, boundary=boundary)
-        return Task(read_domain(MeshFile.of(args, args.file), settings, progress), settings)
+        return Source(read_domain(MeshFile.of(args, args.file), settings, progress), settings)
     refuse(args, ("clean", "inside"), "this option is for meshes; for tensors on a grid, see --repair and --mask")
     refuse(args, ("tensors",), "this option is for a mesh inside a volume; leave it out for the volume itself")
     settings = Settings.of(args, boundary=boundary)
@@ -41,6 +41,6 @@ def read_task(args: argparse.Namespace, progress: Progress, boundary: BoundarySp
         why = f"the eigenpairs in {args.file} determine this setting; leave the option out"
         refuse(args, (*defaults(add_metric, add_reading, add_solving), "save_pairs"), why)
         saved = saved_pairs.read_pairs(args.file, settings, progress)
-        return Task(saved.domain, saved.settings, saved)
+        return Source(saved.domain, saved.settings, saved)
     volume = read_volume(Reading.of(args), progress)
-    return Task(domain_of_volume(volume, settings, format_of(args.file).image), settings)
+    return Source(domain_of_volume(volume, settings, format_of(args.file).image), settings)
