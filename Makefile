@@ -3,7 +3,6 @@
 #   make demo        the heat kernel signature of a real brain slice: pictures in demo/
 #   make test        the tests
 #   make test-slow   the tests that take minutes
-#   make test-all    both in one session, which shares what is compiled
 #   make test-optimised   tests of the numerical core, compiled as users have it
 #   make test-lowest   a few tests with the lowest versions that pyproject.toml allows
 #   make stress      random problems against independent answers, an hour of them
@@ -39,7 +38,7 @@ LIBRARIES := $(addprefix tests/,project/test_import.py io/test_io.py io/test_nrr
     cli/test_cli.py::test_npz_end_to_end_equals_the_library)
 LOWEST := $(VENV)/lowest
 
-.PHONY: browser demo test test-slow test-all test-optimised test-lowest stress lint notebooks docs dist tools tables \
+.PHONY: browser demo test test-slow test-optimised test-lowest stress lint notebooks docs dist tools tables \
     clean
 .DELETE_ON_ERROR:
 
@@ -51,9 +50,6 @@ test: $(STAMPS)/test
 
 test-slow: $(STAMPS)/test
 	$(ONE_THREAD) $(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m slow
-
-test-all: $(STAMPS)/test
-	$(ONE_THREAD) $(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 
 # The other tests are compiled with hardly an optimisation; an empty XLA_FLAGS leaves them all on.
 test-optimised: $(STAMPS)/test
