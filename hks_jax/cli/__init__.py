@@ -6,6 +6,7 @@ examples:
   hks-jax hks tensor.nii.gz -o out --mask mask.nii.gz --slice z=14 --metric inverse
   hks-jax modes tensor.nii.gz -o out --operator fick --map bold.nii.gz
   hks-jax batch subjects.tsv -o study --metric inverse --atlas atlas.nii.gz
+  hks-jax bids derivatives/qsirecon out participant --participant-label 01 --metric inverse
   hks-jax hks --help
 """
 
@@ -30,9 +31,9 @@ from hks_jax.cli.inputs import require_inputs_kept
 from hks_jax.cli.options import SPELLED, add_command, as_options
 from hks_jax.cli.outputs import show
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.study import batch
+from hks_jax.cli.study import batch, bids
 
-COMMANDS = (hks, modes, smooth, spectrum, curvature, fit, batch, stats, plot, explore, info, convert, demo)
+COMMANDS = (hks, modes, smooth, spectrum, curvature, fit, batch, bids, stats, plot, explore, info, convert, demo)
 """A module for each command: its docstring is the help text, `OPTIONS` lists its options, and `run` runs it.
 
 The function `writes` of commands with input files returns the files that the command may write.

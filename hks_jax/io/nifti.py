@@ -30,6 +30,9 @@ _LENGTHS = {0: ("", 1.0), 1: ("m", 1e3), 2: ("mm", 1.0), 3: ("um", 1e-3)}
 """The unit of length for each code in NIfTI's xyzt_units, and its size in mm. Code 0, no unit, is read as mm."""
 _HEADERS_OF_2 = (b"\x1c\x02\0\0", b"\0\0\x02\x1c")
 """The first bytes of NIfTI-2, the size of its header in both byte orders."""
+SCALAR = {"Type": "scalar"}
+"""The entry OrientationEncoding that the draft of BIDS for diffusion derivatives (BIDS Extension Proposal 16) requires
+for images of more than three dimensions, here if the fourth axis has times, and not directions."""
 _REFERENCES = {"ijk": "voxel", "bvec": "fsl", "xyz": "world", "scanner": "world"}
 """The frame for each value of Reference in BIDS's field OrientationEncoding, including values from drafts of BIDS."""
 _COMPONENT = re.compile(r"(?:^|[_.-])(?:dt|t|d)?(xx|xy|xz|yy|yz|zz)(?=[_.])", re.IGNORECASE)
@@ -256,7 +259,8 @@ def _write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra
         raise ValueError(f"extra: got {', '.join(others)}; expected only times for NIfTI. Write an .npz as well")
     if "times" in extra:
         sources = [Path(volume.source).name] if volume.source else []
-        about = {"Quantity": name, "Times": np.ravel(extra["times"]).tolist(), "Sources": sources}
+        times = np.ravel(extra["times"]).tolist()
+        about = {"Quantity": name, "Times": times, "Sources": sources, "OrientationEncoding": SCALAR}
         settings = json.loads(record).get("settings")
         write_json(sidecar_of(path), about | ({"Settings": settings} if settings else {}))
     image = optional("nibabel").Nifti1Image(images_of(array, volume), volume.volume_affine)
