@@ -73,8 +73,9 @@ def run_study(
     show(args, Done(files, {"failed": failed}, "\n".join(shown)))
     if failed:
         raise ComputationError(
-            f"{len(failed)} of {len(chosen)} subjects failed ({_listed(failed)}); {study.folder / 'logs'} contains the "
-            "reasons. The other subjects are done. Repeat the command to compute the failed subjects again"
+            f"{len(failed)} of {len(chosen)} subjects failed ({_listed(failed)}), the first because: "
+            f"{problems[failed[0]].removeprefix(FAILED)}. The logs in {study.folder / 'logs'} have all reasons. Repeat "
+            "the command to compute the failed subjects again"
         )
     if undrawn:
         raise ComputationError(
@@ -100,9 +101,8 @@ def collect(args: argparse.Namespace, subjects: list[Subject], begun: Progress, 
         for name, problem in problems.items():
             progress.warn(f"{name}: {problem}")
         if len(problems) == len(subjects):
-            raise ValueError(
-                f"OUT: none of the {len(subjects)} results is in {study.folder}: {problems[subjects[0].name]}"
-            )
+            first = f"{subjects[0].name}: {problems[subjects[0].name]}"
+            raise ValueError(f"OUT: {study.folder} has none of the {len(subjects)} results. {first}")
         files = write_group(study, subjects, problems)
     without = list(problems)
     show(args, Done(files, {"without": without}, "\n".join(str(file) for file in files if file.suffix == ".tsv")))

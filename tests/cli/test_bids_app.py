@@ -1,0 +1,165 @@
+"""The BIDS app on trees as QSIRecon, QSIPrep, FSL and MRtrix write them: its results, its levels, and bad input."""
+
+import csv
+import json
+import re
+
+import derivatives as tree
+import nibabel as nib
+import numpy as np
+import pytest
+
+from hks_jax.cli import main
+
+GIVEN = ("--metric", "inverse", "--slice", "z=1", "-k", "6", "--boundary", "neumann", "--times", "1e4", "3e4", "-q")
+HKS = "_model-tensor_param-hks"
+
+
+def table(path):
+    with open(path, encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream, delimiter="\t"))
+
+
+def contents(folder):
+    files = [path for path in folder.rglob("*") if path.is_file() and path.parent.name != "logs"]
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+
+
+@pytest.fixture
+def app(tmp_path, monkeypatch):
+    """Call the app on the folder ``in``; pictures are not drawn."""
+    monkeypatch.setattr(
+        "hks_jax.cli.study.tasks.signature_panels", lambda result, path, **_: path.write_text("picture")
+    )
+
+    def call(*words, out="out"):
+        return main(["bids", str(tmp_path / "in"), str(tmp_path / out), *words])
+
+    return call
+
+
+def test_participants_are_jobs_and_the_group_collects(tmp_path, app, monkeypatch, capsys):
+    for entities, scale in ((("ses-1", "run-1"), 1.0), (("ses-1", "run-2"), 1.2), (("ses-2", "acq-fast"), 0.9)):
+        tree.bep16(tmp_path / "in", "01", *entities, scale=scale)
+        tree.labels(tmp_path / "in", "01", *entities)
+    tree.qsirecon(tmp_path / "in", "02", "ses-1")
+    tree.labels(tmp_path / "in", "02", "ses-1")
+    (tmp_path / "in" / "participants.tsv").write_text("participant_id\tage\nsub-02\t41\nsub-01\t30\n")
+    (tmp_path / "in" / "sub-03" / "dwi").mkdir(parents=True)
+    more = ("--skip-bids-validation", "--atlas", "seg-Halves")
+    assert app("participant", "--participant-label", "01", *GIVEN, *more) == 0
+    stems = [f"sub-01_{one}_space-ACPC{HKS}" for one in ("ses-1_run-1", "ses-1_run-2", "ses-2_acq-fast")]
+    out = tmp_path / "out"
+    for stem in stems:
+        folder = out / "sub-01" / re.search("ses-.", stem)[0]
+        assert nib.load(folder / "dwi" / f"{stem}_dwimap.nii.gz").shape == (8, 7, 1, 2)
+        assert (folder / "figures" / f"{stem}_dwimap.png").is_file()
+        assert (out / "logs" / f"{stem.removesuffix(HKS)}.log").read_text().endswith("\ndone\n")
+    assert app("participant", "--participant_label", "02", "-q") == 0  # options, also the labels, are those of OUT
+
+    # A repeated job computes nothing; one with other settings is refused.
+    before = contents(out)
+    with monkeypatch.context() as patch:
+        patch.setattr("hks_jax.cli.study.tasks._compute", None)
+        assert app("participant", "--participant-label", "sub-01", "02", "-q") == 0
+        assert app("participant", "--participant-label", "01", "-q", "-k", "7") == 2
+        assert "has -k 6, not 7. Leave" in capsys.readouterr().err
+        assert contents(out) == before
+        assert app("group", "-q") == 0
+    assert "sub-03: failed: sub-03: no tensors" in capsys.readouterr().err
+    rows = table(out / "group_summary.tsv")
+    assert [(row["participant_id"], row["session_id"], row["run"], row["acq"], row["status"]) for row in rows] == [
+        ("sub-01", "ses-1", "1", "n/a", "done"),
+        ("sub-01", "ses-1", "2", "n/a", "done"),
+        ("sub-01", "ses-2", "n/a", "fast", "done"),
+        ("sub-02", "ses-1", "n/a", "n/a", "done"),
+        ("sub-03", "n/a", "n/a", "n/a", "failed"),
+    ]
+    regions = table(out / "group_regions.tsv")
+    assert len(regions) == 4 * 2 * 2
+    assert {row["region"] for row in regions} == {"left", "right"}
+    people = table(out / "participants.tsv")
+    assert people == [{"participant_id": f"sub-0{i}", "age": age} for i, age in ((1, "30"), (2, "41"), (3, "n/a"))]
+
+    # A damaged result is no result of the group, until its job is repeated.
+    npz = out / "sub-02" / "ses-1" / "dwi" / f"sub-02_ses-1_space-ACPC{HKS}_dwimap.npz"
+    npz.write_bytes(b"half of it")
+    collected = contents(out)
+    assert app("group", "-q") == 0
+    row = table(out / "group_summary.tsv")[3]
+    assert (row["status"], row["problem"]) == ("pending", f"{npz} is damaged: its SHA-256 is not that of the sidecar")
+    assert {row["participant_id"] for row in table(out / "group_regions.tsv")} == {"sub-01"}
+    assert app("participant", "--participant-label", "02", "-q") == 0
+    assert app("group", "-q") == 0
+    assert {name for name, content in contents(out).items() if collected[name] != content} == {
+        npz.relative_to(out).as_posix()
+    }
+    assert npz.read_bytes() == before[npz.relative_to(out).as_posix()]
+
+
+def test_all_programs_give_the_same_signature(tmp_path, app):
+    """Tensors in three conventions, and images to which they are fitted, within the same mask."""
+    tree.dtifit(tmp_path / "in", "fsl")
+    tree.mrtrix(tmp_path / "in", "mrtrix")
+    tree.qsiprep(tmp_path / "in", "qsiprep")
+    folder = tree.qsirecon(tmp_path / "in", "qsirecon")
+    tree.image(folder / "sub-qsirecon_space-ACPC_desc-brain_mask.nii.gz", tree.mask())
+    assert app("participant", *GIVEN, "--save-pairs") == 0
+    values = {}
+    for label in ("fsl", "mrtrix", "qsiprep", "qsirecon"):
+        (file,) = (tmp_path / "out" / f"sub-{label}" / "dwi").glob("*_dwimap.npz")
+        values[label] = np.load(file)["hks"]
+    assert np.isfinite(values["fsl"][0]).sum() == 7 * 6
+    for label in ("mrtrix", "qsirecon"):
+        np.testing.assert_allclose(values[label], values["fsl"], rtol=1e-5)
+    np.testing.assert_allclose(values["qsiprep"], values["fsl"], rtol=1e-3)
+
+
+def test_units_of_the_sidecar_are_read(tmp_path, app, capsys):
+    tree.bep16(tmp_path / "in", "01", scale=1e3, unit="um^2/ms")
+    tree.bep16(tmp_path / "in", "02", unit="mm^2/s")
+    tree.bep16(tmp_path / "in", "03", unit="10^-3 mm^2/s")
+    assert app("participant", *GIVEN) == 0
+    one, two = (np.load(next((tmp_path / "out" / f"sub-0{i}" / "dwi").glob("*.npz")))["hks"] for i in (1, 2))
+    np.testing.assert_allclose(one, two, rtol=1e-5)
+    sidecars = [json.loads(next((tmp_path / "out" / f"sub-0{i}" / "dwi").glob("*.json")).read_text()) for i in (1, 3)]
+    notes = [sidecar["Input"]["notes"] for sidecar in sidecars]
+    assert any("convert them from um2/ms, which the sidecar declares, to mm²/s" in note for note in notes[0])
+    assert any("the Units '10^-3 mm^2/s' of the sidecar are ignored" in note for note in notes[1])
+
+
+def test_automatic_times_suit_all_participants_and_are_chosen_once(tmp_path, app, monkeypatch, capsys):
+    for label, scale in (("01", 1.0), ("02", 1.1)):
+        tree.bep16(tmp_path / "in", label, scale=scale)
+    auto = [word for word in GIVEN if word not in ("1e4", "3e4", "--times")]
+    assert app("prepare", *auto, "--times", "auto:2", "--json") == 0
+    times = json.loads(capsys.readouterr().out)["times"]
+    assert app("participant", "--participant-label", "01", *auto, "--times", "auto:2", out="alone") == 0
+    assert json.loads((tmp_path / "alone" / "study.json").read_text())["times"] == times  # also of the other
+    monkeypatch.setattr("hks_jax.cli.study.settings.suitable_range", None)
+    assert app("participant", "--participant-label", "01", "-q") == 0
+    npz = next((tmp_path / "out" / "sub-01" / "dwi").glob("*_dwimap.npz"))
+    assert np.load(npz)["times"].tolist() == times
+
+
+def test_bad_input_is_refused(tmp_path, app, capsys):
+    def refused(*words):
+        assert app(*words) == 2
+        return capsys.readouterr().err
+
+    assert "no such folder" in refused("participant", *GIVEN)
+    tree.qsirecon(tmp_path / "in", "01")
+    (tmp_path / "in" / "sub-02" / "dwi").mkdir(parents=True)
+    assert "LEVEL: got 'run'; expected one of prepare, participant, group" in refused("run", *GIVEN)
+    assert "got 07; the participants in" in refused("participant", "--participant-label", "07", *GIVEN)
+    assert "sub-02: no tensors" in refused("participant", "--participant-label", "02", *GIVEN)
+    assert "leave the option out" in refused("group", "--participant-label", "01", *GIVEN)
+    assert "there are no results in" in refused("group", *GIVEN)
+    assert "--metric: choose the metric" in refused("prepare", "-q")
+    assert "--select: got 'ACPC'" in refused("participant", "--select", "ACPC", *GIVEN)
+    assert "--mask: got desc-x, but no file" in refused("participant", "--mask", "desc-x", *GIVEN)
+    assert not (tmp_path / "out").exists()
+    assert app("prepare", *GIVEN) == 0
+    assert "has none of the 2 results. sub-01_space-ACPC: not computed" in refused("group")
+    assert app("participant", "--components", "all", out="other") == 2  # without a metric
+    assert "--metric" in capsys.readouterr().err
