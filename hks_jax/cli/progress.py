@@ -197,7 +197,8 @@ class StudyProgress(Progress):
     @contextmanager
     def stage(self, name: str, detail: str = "") -> Iterator[None]:
         """Announce a stage and measure its time."""
-        self.note(f"{name}: {detail}" if detail else name)
+        if self._on_terminal:  # where the stage is drawn, and not noted
+            self.note(f"{name}: {detail}" if detail else name)
         with super().stage(name, detail):
             yield
 

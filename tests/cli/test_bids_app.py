@@ -2,7 +2,12 @@
 
 import csv
 import json
+import os
 import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import derivatives as tree
 import nibabel as nib
@@ -53,7 +58,7 @@ def test_participants_are_jobs_and_the_group_collects(tmp_path, app, monkeypatch
     for stem in stems:
         folder = out / "sub-01" / re.search("ses-.", stem)[0]
         assert nib.load(folder / "dwi" / f"{stem}_dwimap.nii.gz").shape == (8, 7, 1, 2)
-        assert (folder / "figures" / f"{stem}_dwimap.png").is_file()
+        assert (out / "sub-01" / "figures" / f"{stem}_dwimap.png").is_file()
         assert (out / "logs" / f"{stem.removesuffix(HKS)}.log").read_text().endswith("\ndone\n")
     assert app("participant", "--participant_label", "02", "-q") == 0  # options, also the labels, are those of OUT
 
@@ -163,3 +168,66 @@ def test_bad_input_is_refused(tmp_path, app, capsys):
     assert "has none of the 2 results. sub-01_space-ACPC: not computed" in refused("group")
     assert app("participant", "--components", "all", out="other") == 2  # without a metric
     assert "--metric" in capsys.readouterr().err
+
+
+def recipe(language):
+    """Return a block of the documentation."""
+    page = (Path(__file__).parents[2] / "docs" / "bids.md").read_text(encoding="utf-8")
+    return re.search(rf"```{language}\n(.*?)```", page, re.DOTALL)[1]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("snakemake") is None, reason="snakemake is not installed")
+def test_snakemake_runs_three_participants_and_resumes_after_a_killed_job(tmp_path, monkeypatch):
+    """The recipe of the documentation, with a program that dies once, in the middle of a participant."""
+    data = tmp_path / "derivatives" / "qsirecon-DSIStudio"
+    for label in ("01", "02", "03"):
+        tree.qsirecon(data, label, "ses-1")
+    (tmp_path / "Snakefile").write_text(recipe("snakemake"))
+    program = tmp_path / "bin" / "hks-jax"
+    program.parent.mkdir()
+    program.write_text(
+        f"#!/bin/bash\n[[ $* == *' 02' && ! -e killed ]] || exec {sys.executable} -m hks_jax \"$@\"\n"
+        f'touch killed\n{sys.executable} -m hks_jax "$@" &\n'
+        "until grep -q eigenpairs out/logs/sub-02_*.log; do sleep 0.05; done\nkill -9 $!\nwait $!\n"
+    )
+    program.chmod(0o755)
+    path = f"{program.parent}:{os.environ['PATH']}"
+    environment = {**os.environ, "PATH": path, "JAX_PLATFORMS": "cpu", "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    command = ["snakemake", "--cores", "1", "--keep-going"]
+    options = {"cwd": tmp_path, "env": environment, "capture_output": True, "text": True, "timeout": 400}
+    first = subprocess.run(command, **options)
+    out = tmp_path / "out"
+    assert first.returncode != 0, first.stderr
+    assert sorted(file.name for file in (out / "logs").glob("*.finished")) == ["sub-01.finished", "sub-03.finished"]
+    assert not list(out.glob("sub-02/**/*.json"))
+    assert not (out / "group_summary.tsv").exists()
+    before = contents(out)
+    second = subprocess.run([*command, "--rerun-incomplete"], **options)
+    assert second.returncode == 0, second.stderr
+    assert [row["status"] for row in table(out / "group_summary.tsv")] == ["done"] * 3
+    after = contents(out)
+    assert {name: after[name] for name in before} == before
+    shutil.rmtree(out / "sub-02")
+    monkeypatch.chdir(tmp_path)  # as in the recipe, because results contain the paths of their inputs
+    again = ["bids", str(data.relative_to(tmp_path)), "out", "participant", "--participant-label", "02", "-q"]
+    assert main(again) == 0
+    assert contents(out) == after
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("bids-validator-deno") is None, reason="bids-validator-deno is not installed")
+def test_the_validator_accepts_the_results(tmp_path, app):
+    tree.qsirecon(tmp_path / "in", "01", "ses-1", "run-1")
+    tree.labels(tmp_path / "in", "01", "ses-1", "run-1")
+    assert app("participant", *GIVEN, "--atlas", "seg-Halves", "--save-pairs") == 0
+    assert app("group", "-q") == 0
+    command = ["bids-validator-deno", str(tmp_path / "out"), "--format", "json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100)
+    issues = json.loads(done.stdout)["issues"]["issues"]
+    assert [issue for issue in issues if issue["severity"] == "error"] == []
+
+
+@pytest.mark.skipif(shutil.which("hadolint") is None, reason="hadolint is not installed")
+def test_the_recipe_of_the_container_is_linted():
+    assert subprocess.run(["hadolint", Path(__file__).parents[2] / "containers" / "Dockerfile"]).returncode == 0

@@ -35,7 +35,7 @@ DONE, FAILED, UNFINISHED = "done", "failed: ", "unfinished"
 ABSENT = "not computed"
 DESCRIPTIONS = ("study.json", "dataset_description.json", ".bidsignore", "participants.tsv")
 """The names of the files that describe a study."""
-IGNORED = "study.json\nlogs/\nfigures/\n*_dwimap.*\n*_regions.*\n*_pairs.npz\ngroup_*\n"
+IGNORED = "study.json\nlogs\nfigures\n*_dwimap.*\n*_regions.*\n*_pairs.npz\ngroup_*\n"
 """The files that BIDS's validator ignores. It knows no ``dwimap``, which is of a draft (BIDS Extension Proposal 16)."""
 GENERATED_BY = {"Name": "hks-jax", "Version": __version__}
 _TEMPORARY = re.compile(r"\.[0-9a-f]{12}\..+")
@@ -62,9 +62,9 @@ class Study:
     save_pairs: bool = False
     files: Mapping[str, str] = field(default_factory=dict)
 
-    def path(self, subject: Subject, ending: str, folder: str = "dwi") -> Path:
+    def path(self, subject: Subject, ending: str) -> Path:
         """Return the path of a subject's file."""
-        return self.folder / subject.folder / folder / f"{subject.name}{ending}"
+        return self.folder / subject.folder / "dwi" / f"{subject.name}{ending}"
 
     def log(self, subject: Subject) -> Path:
         """Return the path of the log of a subject's last computation."""
@@ -85,7 +85,7 @@ class Study:
 
     def picture(self, subject: Subject) -> Path:
         """Return the path of the picture of a subject's signature."""
-        return self.path(subject, f"{MAP}.png", "figures")
+        return self.folder / subject.participant / "figures" / f"{subject.name}{MAP}.png"
 
     def fingerprint(self, subject: Subject) -> str:
         """Return a digest of all inputs of a subject's signature; raise FileNotFoundError if a file is missing."""
