@@ -5,6 +5,9 @@ BIDS dataset with such folders in derivatives/. The input of a result is an imag
 components, or else preprocessed diffusion-weighted images, to which tensors are fitted. Each combination of the
 entities ses-, acq-, dir-, run-, space- … in their names is a result of its own, which has these entities in its name.
 
+--mask and --atlas take a file for all participants, or entities that select a file of each participant on the voxels of
+the input, such as desc-brain or seg-4S156Parcels. Without --mask, a mask desc-brain is used if there is one.
+
 LEVEL is one of
 
   prepare      choose the settings and the times that suit all participants, and store them in OUT

@@ -1,4 +1,4 @@
-"""The folder of a study, a BIDS derivative: file names, sidecars, state of subjects, and tables of the group."""
+"""The folder of a study, a BIDS derivative: file names, sidecars, logs, and the state of subjects."""
 
 import argparse
 import hashlib
@@ -111,7 +111,7 @@ class Study:
         about = read_json(self.path(subject, f"{kind}.json"))
         if not about:
             return ABSENT
-        if about.get("Fingerprint") != fingerprint:
+        if about.get("Fingerprint") != fingerprint or "SHA256" not in about:
             return "computed from other files, with other settings or by another version"
         for name, stored in about["SHA256"].items():
             file = self.path(subject, "").with_name(name)
@@ -157,7 +157,7 @@ class Study:
         ours = [file for kind in (MAP, REGIONS) for file in sidecar.parent.glob(f"{subject.name}{kind}.*")]
         for path in [*ours, picture, sidecar.with_name("explore.html")]:
             path.unlink(missing_ok=True)
-        for folder in (sidecar.parent.parent, sidecar.parent, picture.parent):
+        for folder in (sidecar.parent, picture.parent):
             for left in folder.glob(".*") if folder.is_dir() else ():
                 if _TEMPORARY.fullmatch(left.name):
                     shutil.rmtree(left) if left.is_dir() else left.unlink()
