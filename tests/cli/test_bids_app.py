@@ -102,6 +102,7 @@ def test_participants_are_jobs_and_the_group_collects(tmp_path, app, monkeypatch
     assert npz.read_bytes() == before[npz.relative_to(out).as_posix()]
 
 
+@pytest.mark.slow
 def test_all_programs_give_the_same_signature(tmp_path, app):
     """Tensors in three conventions, and images to which they are fitted, within the same mask."""
     tree.dtifit(tmp_path / "in", "fsl")
@@ -118,19 +119,6 @@ def test_all_programs_give_the_same_signature(tmp_path, app):
     for label in ("mrtrix", "qsirecon"):
         np.testing.assert_allclose(values[label], values["fsl"], rtol=1e-5)
     np.testing.assert_allclose(values["qsiprep"], values["fsl"], rtol=1e-3)
-
-
-def test_units_of_the_sidecar_are_read(tmp_path, app, capsys):
-    tree.bep16(tmp_path / "in", "01", scale=1e3, unit="um^2/ms")
-    tree.bep16(tmp_path / "in", "02", unit="mm^2/s")
-    tree.bep16(tmp_path / "in", "03", unit="10^-3 mm^2/s")
-    assert app("participant", *GIVEN) == 0
-    one, two = (np.load(next((tmp_path / "out" / f"sub-0{i}" / "dwi").glob("*.npz")))["hks"] for i in (1, 2))
-    np.testing.assert_allclose(one, two, rtol=1e-5)
-    sidecars = [json.loads(next((tmp_path / "out" / f"sub-0{i}" / "dwi").glob("*.json")).read_text()) for i in (1, 3)]
-    notes = [sidecar["Input"]["notes"] for sidecar in sidecars]
-    assert any("convert them from um2/ms, which the sidecar declares, to mm²/s" in note for note in notes[0])
-    assert any("the Units '10^-3 mm^2/s' of the sidecar are ignored" in note for note in notes[1])
 
 
 def test_automatic_times_suit_all_participants_and_are_chosen_once(tmp_path, app, monkeypatch, capsys):

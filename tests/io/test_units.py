@@ -244,7 +244,13 @@ def test_units_of_sidecars_are_understood_in_usual_spellings(text, unit):
 def test_a_unit_that_is_asked_for_overrides_the_sidecar(tmp_path):
     path = tree.bep16(tmp_path, "01", scale=1e3, unit="um^2/ms")
     np.testing.assert_allclose(read_tensors(path).tensors, tree.tensors(), rtol=1e-6, atol=1e-12)
-    assert read_tensors(path).unit == "mm²/s"
+    assert (read_tensors(path).unit, read_tensors(path, unit="um2/ms").notes) == ("mm²/s", read_tensors(path).notes)
+    assert "tensors multiplied by 0.001 to convert them from um2/ms, which the sidecar declares, to mm²/s" in (
+        read_tensors(path).notes
+    )
     other = read_tensors(path, unit="um2/s")
     np.testing.assert_allclose(other.tensors, 1e-3 * tree.tensors(), rtol=1e-6, atol=1e-15)
     assert "the unit of the tensors is um2/s, as asked; the sidecar declares 'um^2/ms'" in other.notes
+    unknown = read_tensors(tree.bep16(tmp_path, "02", unit="10^-3 mm^2/s"))
+    assert unknown.unit == ""
+    assert any("the Units '10^-3 mm^2/s' of the sidecar are ignored" in note for note in unknown.notes)
