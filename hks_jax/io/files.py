@@ -132,7 +132,7 @@ def save(
 
     - ``.nii``, ``.nii.gz``: an image with the volume's affine and times along the fourth axis. A slice is written as
       an image one voxel thick at its position in space. NaN outside the mask is kept. Times in `extra` are written to
-      NAME.json beside the image as ``Times``, following BIDS.
+      NAME.json beside the image as ``Times``, following BIDS, with the ``OrientationEncoding`` of scalars.
     - ``.nrrd``: the same image with times along the last axis, and `extra` as text in the header.
     - ``.vti``: point data with ``mask`` and one array per time, whose name contains the time; field data with `extra`.
     - ``.npz``: the values as the array `name`, and the arrays in `extra`. For a volume or slice, the npz also contains
