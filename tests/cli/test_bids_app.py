@@ -125,7 +125,7 @@ def test_automatic_times_suit_all_participants_and_are_chosen_once(tmp_path, app
     for label, scale in (("01", 1.0), ("02", 1.1)):
         tree.bep16(tmp_path / "in", label, scale=scale)
     auto = [word for word in GIVEN if word not in ("1e4", "3e4", "--times")]
-    assert app("prepare", *auto, "--times", "auto:2", "--json") == 0
+    assert app("prepare", *auto, "--times", "auto:2", "--select", "space-ACPC", "--json") == 0
     times = json.loads(capsys.readouterr().out)["times"]
     assert app("participant", "--participant-label", "01", *auto, "--times", "auto:2", out="alone") == 0
     assert json.loads((tmp_path / "alone" / "study.json").read_text())["times"] == times  # also of the other
@@ -133,6 +133,7 @@ def test_automatic_times_suit_all_participants_and_are_chosen_once(tmp_path, app
     assert app("participant", "--participant-label", "01", "-q") == 0
     npz = next((tmp_path / "out" / "sub-01" / "dwi").glob("*_dwimap.npz"))
     assert np.load(npz)["times"].tolist() == times
+    assert json.loads((tmp_path / "out" / "study.json").read_text())["files"] == {"select": "space-ACPC"}
 
 
 def test_bad_input_is_refused(tmp_path, app, capsys):
