@@ -144,7 +144,7 @@ def test_bad_input_is_refused(tmp_path, app, capsys):
     assert "no such folder" in refused("participant", *GIVEN)
     tree.qsirecon(tmp_path / "in", "01")
     (tmp_path / "in" / "sub-02" / "dwi").mkdir(parents=True)
-    assert "LEVEL: got 'run'; expected one of prepare, participant, group" in refused("run", *GIVEN)
+    assert "invalid choice: 'run'" in refused("run", *GIVEN)
     assert "got 07; the participants in" in refused("participant", "--participant-label", "07", *GIVEN)
     assert "sub-02: no tensors" in refused("participant", "--participant-label", "02", *GIVEN)
     assert "leave the option out" in refused("group", "--participant-label", "01", *GIVEN)

@@ -33,25 +33,30 @@ import argparse
 from pathlib import Path
 
 from hks_jax.cli.options import refuse
+from hks_jax.cli.parsing import folder
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.study import settings
 from hks_jax.cli.study.folder import written_in
-from hks_jax.cli.study.settings import KEPT
 from hks_jax.cli.study.subjects import Subject, read_subjects
 
-DEFAULTS = settings.DEFAULTS
-OPTIONS = f"""
-subjects SUBJECTS  the table of subjects
--o,--output DIR!  the study's folder
-{KEPT}
-@atlas @names @view @rim
---save-pairs
-    save the eigenpairs of each subject, which other --times, --normalisation or --method then reuse
---replace  replace a study in DIR that has other settings or times
---only SUBJECT...
-    compute only these subjects, such as sub-07 or sub-07_ses-2, without the tables of all subjects, which the command
-    without --only writes
-"""
+USAGE = "SUBJECTS -o DIR"
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    parser.add_argument("subjects", type=Path, metavar="SUBJECTS", help="the table of subjects")
+    parser.add_argument("-o", "--output", type=folder, required=True, metavar="DIR", help="the study's folder")
+    settings.add_options(parser)
+    parser.add_argument(
+        "--replace", action="store_true", help="replace a study in DIR that has other settings or times"
+    )
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        metavar="SUBJECT",
+        help="compute only these subjects, such as sub-07 or sub-07_ses-2, without the tables of all subjects, which "
+        "the command without --only writes",
+    )
 
 
 def writes(args: argparse.Namespace) -> list[Path]:

@@ -29,30 +29,49 @@ import copy
 from pathlib import Path
 
 from hks_jax.cli.options import refuse
-from hks_jax.cli.parsing import parse_folder
+from hks_jax.cli.parsing import folder
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.study import settings
 from hks_jax.cli.study.folder import written_in
-from hks_jax.cli.study.settings import KEPT
 from hks_jax.cli.study.subjects import Subject
 from hks_jax.io.bids import Dataset, Source, are_entities, kept, parse_entities
 
-DEFAULTS = settings.DEFAULTS
-OPTIONS = f"""
-bids_dir BIDS_DIR  folder of derivatives, or a BIDS dataset with derivatives
-output OUT  folder for the results
-level LEVEL  level of the analysis: prepare, participant or group
---participant-label,--participant_label LABEL...  compute only these participants, such as 01 or sub-01
---select ENTITIES  use only inputs with these entities, such as space-ACPC or ses-1_desc-preproc
---skip-bids-validation,--skip_bids_validation  accepted as by other BIDS apps; the dataset is never validated
-{KEPT}
-@atlas @names @view @rim
---save-pairs
-    save the eigenpairs of each subject, which other --times, --normalisation or --method then reuse
---replace  replace results in OUT that have other settings or times
-"""
-LEVELS = ("prepare", "participant", "group")
+USAGE = "BIDS_DIR OUT LEVEL"
 _BRAIN = {"desc": "brain"}
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    parser.add_argument(
+        "bids_dir", metavar="BIDS_DIR", help="folder of derivatives, or a BIDS dataset with derivatives"
+    )
+    parser.add_argument("output", type=folder, metavar="OUT", help="folder for the results")
+    parser.add_argument(
+        "level",
+        choices=("prepare", "participant", "group"),
+        metavar="LEVEL",
+        help="level of the analysis: prepare, participant or group",
+    )
+    parser.add_argument(
+        *("--participant-label", "--participant_label"),
+        nargs="+",
+        metavar="LABEL",
+        help="compute only these participants, such as 01 or sub-01",
+    )
+    parser.add_argument(
+        "--select",
+        metavar="ENTITIES",
+        help="use only inputs with these entities, such as space-ACPC or ses-1_desc-preproc",
+    )
+    parser.add_argument(
+        *("--skip-bids-validation", "--skip_bids_validation"),
+        action="store_true",
+        help="accepted as by other BIDS apps; the dataset is never validated",
+    )
+    settings.add_options(parser)
+    parser.add_argument(
+        "--replace", action="store_true", help="replace results in OUT that have other settings or times"
+    )
 
 
 def writes(args: argparse.Namespace) -> list[Path]:
@@ -64,12 +83,6 @@ def run(args: argparse.Namespace, begun: Progress) -> None:
     """Run the command; if some subjects fail, raise ComputationError after computing the others."""
     from hks_jax.cli.study.tasks import collect, prepare, run_study
 
-    if args.level not in LEVELS:
-        raise ValueError(f"LEVEL: got {args.level!r}; expected one of {', '.join(LEVELS)}")
-    try:
-        parse_folder(str(args.output))
-    except argparse.ArgumentTypeError as error:
-        raise ValueError(f"OUT: {error}") from error
     if args.level != "participant" and args.participant_label is not None:
         raise ValueError(f"--participant-label: got the level {args.level}, which is for all; leave the option out")
     note, dataset = settings.complete(args), Dataset(Path(args.bids_dir), args.output)

@@ -9,12 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hks_jax.cli import options
 from hks_jax.cli.computation import Settings
 from hks_jax.cli.info import describe
-from hks_jax.cli.options import FILES, READING, SOLVING, defaults, flag, options_in
+from hks_jax.cli.options import FILES, defaults, flag
 from hks_jax.cli.parsing import Times
 from hks_jax.cli.progress import StudyProgress
-from hks_jax.cli.reading import read_volume
+from hks_jax.cli.reading import Reading, read_volume
 from hks_jax.cli.study.folder import DESCRIPTIONS, Study, reading_options
 from hks_jax.cli.study.subjects import Subject
 from hks_jax.io import TensorVolume
@@ -24,18 +25,45 @@ from hks_jax.io.tables import read_json
 from hks_jax.signatures.spans import SHORTEST
 from hks_jax.signatures.times import LAST
 
-KEPT = f"""
-@metric {READING} {SOLVING} @signature @noise
---time-unit scanner|lambda1 = scanner
-    unit of --times: scanner, for the same t for all subjects, in seconds for D in mm²/s with the metric D⁻¹ or Fick's
-    operator (default); or lambda1,
-    for the same product λ₁t, so that the given numbers are divided by each subject's first positive eigenvalue λ₁.
-    Automatic times are log-spaced over the range that suits all subjects, and the study keeps them
-"""
-DEFAULTS = {option.name: None for option in options_in(KEPT) if option.name not in FILES}
-"""The options that a study keeps, with the default None, by which omitted options are recognised."""
 ENTITIES = ("select", "mask", "atlas")
 """Options that may select files by BIDS entities, and which a study keeps beside its settings."""
+
+
+def add_kept(parser: argparse.ArgumentParser) -> None:
+    """Add the options that a study keeps."""
+    options.add_metric(parser)
+    options.add_reading(parser)
+    options.add_solving(parser)
+    options.add_signature(parser)
+    options.add_noise(parser)
+    parser.add_argument(
+        "--time-unit",
+        choices=("scanner", "lambda1"),
+        default="scanner",
+        help="unit of --times: scanner, for the same t for all subjects, in seconds for D in mm²/s with the metric "
+        "D⁻¹ or Fick's operator (default); or lambda1, for the same product λ₁t, so that the given numbers are "
+        "divided by each subject's first positive eigenvalue λ₁. Automatic times are log-spaced over the range that "
+        "suits all subjects, and the study keeps them",
+    )
+
+
+DEFAULTS = dict.fromkeys(name for name in defaults(add_kept) if name not in FILES)
+"""The options that a study keeps, with the default None, by which omitted options are recognised."""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that commands on several subjects share."""
+    add_kept(parser)
+    parser.set_defaults(**DEFAULTS)
+    options.add_atlas(parser)
+    options.add_names(parser)
+    options.add_view(parser)
+    options.add_rim(parser)
+    parser.add_argument(
+        "--save-pairs",
+        action="store_true",
+        help="save the eigenpairs of each subject, which other --times, --normalisation or --method then reuse",
+    )
 
 
 def complete(args: argparse.Namespace) -> str:
@@ -52,7 +80,7 @@ def complete(args: argparse.Namespace) -> str:
             setattr(args, name, Path(path))
             taken.append(f"{flag(name)} {path}")
     # Comparable subjects need the same boundary condition, with or without a mask.
-    usual = {**vars(defaults(KEPT)), "boundary": "mean"}
+    usual = {**defaults(add_kept), "boundary": "mean"}
     for name in DEFAULTS:
         if getattr(args, name) is None:
             value = kept.get(name, usual[name])
@@ -128,7 +156,7 @@ def _suitable(
     for number, subject in enumerate(subjects, 1):
         progress.update(f"choosing times: {subject.name}, {number} of {len(subjects)}")
         try:
-            ranges[subject.name] = suitable_range(read_volume(subject.args, silent), subject.args)
+            ranges[subject.name] = suitable_range(read_volume(Reading.of(subject.args), silent), subject.args)
         except Exception as error:  # reported when the subject is computed
             first = first or f"{subject.name}: {error}"
     if not ranges:
