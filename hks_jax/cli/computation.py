@@ -27,6 +27,12 @@ from hks_jax.signatures.times import FREE, default_k, times_of
 
 EARLY = 0.02
 """The truncated share of the signature above which the boundary's influence is estimated without eigenpairs."""
+# Residuals are orthogonal to all m vectors of the filter, so that the error δᵢ of φᵢ is too, and ‖δᵢ‖ is at most the
+# residual divided by λₘ₊₁ − λᵢ. To first order, errors change Σ f(λᵢ)φᵢ² by 2 Σ f(λᵢ)φᵢδᵢ, where f(λᵢ) is small for the
+# pairs with the largest ‖δᵢ‖. Errors of the eigenvalues are of second order.
+_TOLERANCE = 1e-4
+"""The largest relative residual of the Chebyshev filter. On a brain of 85 000 voxels (k = 75), residuals up to 7e-4
+changed the signature by at most 2.4e-4 of its value at any node, and residuals up to 4e-5 by 1.1e-5, for t ≥ 4/λ_k."""
 HALF = 0.45
 """The share of nodes free of the boundary below which a time is warned of; automatic times aim at one half."""
 
@@ -246,9 +252,11 @@ def solve(pencil: hj.Pencil | hj.MirrorPencil, settings: Settings, progress: Pro
     unknowns, dimension = sum(part.space.n_dof for part in pencil.parts), pencil.space.dimension
     assert dimension is not None
     k = default_k(dimension, unknowns) if settings.k is None else settings.k
-    name = choose_solvers(settings.solver, pencil, k)[0].name
-    with progress.stage("eigenpairs", f"{k} of {unknowns} by {name}"):
-        pairs = hj.eigenpairs(pencil, k, solver=settings.solver, progress=progress.update)
+    solver = choose_solvers(settings.solver, pencil, k)[0]
+    # The choice of a solver by name may differ between the two problems of "mean", so the name is handed on.
+    chosen = replace(solver, tolerance=_TOLERANCE) if isinstance(solver, hj.ChebyshevFilter) else settings.solver
+    with progress.stage("eigenpairs", f"{k} of {unknowns} by {solver.name}"):
+        pairs = hj.eigenpairs(pencil, k, solver=chosen, progress=progress.update)
         jax.block_until_ready(pairs.eigenvalues)
     if not np.asarray(pairs.converged).all():
         raise ComputationError(pairs.messages()[0])
