@@ -21,13 +21,21 @@ JOBS ?= auto
 # As many BLAS threads as cores in each of them, or for each of eight virtual devices, would fight for the cores.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1
 
+# Modules are compiled once, not by every process that starts.
+export PYTHONDONTWRITEBYTECODE :=
+
 BIN := $(VENV)/bin
 # A stamp is newer than pyproject.toml as long as what it names is installed: nothing is installed twice.
 STAMPS := $(VENV)/.stamps
 BRAIN := mdt==1.2.7
-# What rounding and the order of operations reach first: solvers, factorisations and derivatives.
-CORE := $(addprefix tests/,$(patsubst %,eigen/test_%.py,eigenpairs block_lanczos derivatives) \
-    signatures/test_float32.py fem/test_assembly.py project/test_outermost_derivatives.py)
+# What rounding and the order of operations reach first: each solver, factorisation and kind of derivative.
+CORE := $(addprefix tests/,fem/test_assembly.py signatures/test_float32.py linear/test_dense_eigh.py \
+    linear/test_symmetric_inverse.py linear/test_selected_inversion.py linear/test_matrix_function.py \
+    linear/test_factorisation.py::test_all_results_against_the_dense_matrix \
+    eigen/test_block_lanczos.py::test_factorisation_solves_and_counts \
+    $(addprefix eigen/test_eigenpairs.py::test_,solvers_agree jit_and_vmap_give_the_looped_result) \
+    eigen/test_chebyshev_filter.py::test_pairs_equal_the_dense_ones \
+    $(addprefix eigen/test_derivatives.py::test_,hks_against_differences every_signature_against_differences))
 
 # What calls the libraries that the package stands on: those for files, jax and scipy, matplotlib, lineax and optimistix.
 LIBRARIES := $(addprefix tests/,project/test_import.py io/test_io.py io/test_nrrd.py io/test_mesh_io.py \

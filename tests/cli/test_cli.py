@@ -171,6 +171,7 @@ def test_times_that_do_not_suit_the_domain_are_reported(npz, tmp_path):
     assert ["too few eigenpairs" in title for title in signature.titles_of(Result.read(out))] == [True, False, False]
 
 
+@pytest.mark.slow
 def test_report_says_what_was_done(npz, tmp_path, capsys):
     out = tmp_path / "out"
     # A time that 25 pairs do not resolve: the report carries the warning and a large truncation.
@@ -324,7 +325,7 @@ def test_bad_voxels_are_refused_before_anything_is_computed(nifti, tmp_path, cap
     "extra",
     [
         ["--boundary", "dirichlet:neumann,neumann", "--solver", "dense"],
-        ["--boundary", "mean", "--normalisation", "flat"],
+        pytest.param(["--boundary", "mean", "--normalisation", "flat"], marks=pytest.mark.slow),
         ["--solver", "shift-invert", "--normalisation", "heat-trace"],
         pytest.param(
             ["--metric", "adjugate", "--erode", "1", "--interpolation", "log-euclidean"], marks=pytest.mark.slow
@@ -368,6 +369,7 @@ def test_options_reach_the_computation(npz, tmp_path, extra):
             assert dtype == np.float32
 
 
+@pytest.mark.slow
 def test_a_mask_of_the_slice_alone_and_the_largest_component(nifti, tmp_path):
     mask = disc()
     mask[7:9] = False  # two halves, one larger
@@ -435,6 +437,7 @@ def test_the_command_line_keeps_what_it_compiled_and_the_package_nothing(npz, tm
     assert {file: time for file, time in kept().items() if file in before} == before  # read, and not made again
 
 
+@pytest.mark.slow
 def test_module_runs_in_a_process_of_its_own(npz, tmp_path):
     out = tmp_path / os.fsdecode("λ".encode() + b"\xff")  # printed in ASCII, and invalid in UTF-8
     command = [
@@ -466,6 +469,7 @@ def test_module_runs_in_a_process_of_its_own(npz, tmp_path):
 # ---------------------------------------------------------------------------------------------------- demo
 
 
+@pytest.mark.slow
 def test_demo_without_data_does_the_phantom(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(demo, "find_example_brain", lambda: None)
     monkeypatch.setattr(demo, "PHANTOM_SHAPE", (32, 32))
@@ -615,6 +619,7 @@ def test_ctrl_c_amid_a_computation_leaves_nothing_but_one_line(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["t.npz"]
 
 
+@pytest.mark.slow
 def test_ctrl_c_in_a_callback_of_the_garbage_collector_is_not_lost(tmp_path):
     # The signal comes while a callback runs that the collector calls, where Python discards every exception.
     script = """

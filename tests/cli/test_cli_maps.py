@@ -217,6 +217,7 @@ def smoothed_on(path, mesh, f, *more):
         return found["smoothed"]
 
 
+@pytest.mark.slow
 def test_maps_are_smoothed_on_a_surface(tmp_path, rng, capsys):
     mesh = surface(tmp_path / "s.surf.gii")
     vertices = np.asarray(mesh.vertices).astype(np.float32).astype(np.float64)

@@ -113,6 +113,7 @@ def test_curvature_end_to_end(sphere, tmp_path, capsys):
     assert min(png_size(tmp_path / "K.png")) > 300
 
 
+@pytest.mark.slow
 def test_curvature_of_a_slice_of_a_volume(tmp_path, capsys):
     tensors = np.zeros((12, 11, 3, 3, 3))
     x = np.arange(12)[:, None, None]
@@ -163,7 +164,8 @@ def test_plot_draws_what_is_asked_for(result, tmp_path, capsys, arguments, times
     assert [p.name for p in picture.parent.iterdir()] == ["p.png"]
 
 
-@pytest.mark.parametrize("points", [pytest.param([], marks=pytest.mark.slow), ["--points", "1.5,4", "3,7"]])
+@pytest.mark.slow
+@pytest.mark.parametrize("points", [[], ["--points", "1.5,4", "3,7"]])
 def test_a_raw_signature_is_scaled_once_and_a_flat_one_never(result, tmp_path, capsys, points):
     raw = Result.read(result)
     drawn = {}

@@ -36,6 +36,7 @@ def bytes_in(folder):
     return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+@pytest.mark.slow
 def test_one_eigenpair_is_a_constant_signature(field, tmp_path):
     """The mode of λ = 0 alone: 1/area, where no time is resolved."""
     out = tmp_path / "out"
@@ -123,6 +124,7 @@ def subjects(tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_a_repeated_study_keeps_its_names_and_draws_what_it_lacks(subjects, capsys, monkeypatch):
     study = subjects / "study"
     given = ["batch", str(subjects / "subjects.tsv"), "-o", str(study)]

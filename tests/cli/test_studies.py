@@ -338,6 +338,7 @@ def test_one_bad_subject_does_not_stop_the_others(study, monkeypatch, capsys):
     assert {row["participant_id"] for row in table(study / "out" / "group_regions.tsv")} == {"sub-03"}
 
 
+@pytest.mark.slow
 def test_subjects_in_other_units_are_refused_and_open_frames_are_said(study, monkeypatch, capsys):
     monkeypatch.setattr(
         "hks_jax.cli.study.tasks.signature_panels", lambda result, path, **_: path.write_text("picture")
@@ -401,6 +402,7 @@ def test_a_subject_is_done_again_when_its_sidecar_changes(study):
     assert [a == b for a, b in zip(before, after, strict=True)] == [False, False, True]
 
 
+@pytest.mark.slow
 def test_a_damaged_or_foreign_result_is_computed_again_and_said(study, monkeypatch, capsys):
     monkeypatch.setattr(
         "hks_jax.cli.study.tasks.signature_panels", lambda result, path, **_: path.write_text("picture")
@@ -474,6 +476,7 @@ def test_common_times_suit_all_subjects():
         common_times({"sub-01": Range(2.0, 1.0, 3.0), "sub-02": Range(4.0, 5.0, 9.0)}, 3, "scanner")
 
 
+@pytest.mark.slow
 def test_automatic_times_follow_the_metric_and_remain_those_of_the_study(study, monkeypatch, capsys):
     def suitable(scale, k, boundary, metric="inverse", operator="laplace-beltrami"):
         args = argparse.Namespace(file=Path("t.nii"), metric=metric, operator=operator, k=k, boundary=boundary)
@@ -708,7 +711,8 @@ def test_a_study_has_errors_of_regions_and_computes_again_what_had_other_noise(s
         assert text in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("boundary", ["neumann", pytest.param("mean", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("boundary", ["neumann", "mean"])
 def test_saved_pairs_give_the_signature_of_other_times_without_another_computation(
     tmp_path, monkeypatch, capsys, boundary
 ):
@@ -759,6 +763,7 @@ def test_pairs_of_another_pencil_are_refused(tmp_path):
         hj.io.save_pairs(tmp_path / "p.npy", pairs)
 
 
+@pytest.mark.slow
 def test_a_folder_that_is_used_again_holds_one_result(tmp_path, monkeypatch, capsys):
     """What was made of an earlier signature goes with it; eigenpairs stay where they are those of the new one."""
     monkeypatch.setattr("hks_jax.plot.signature_panels", lambda result, path, **_: path.write_text("picture"))

@@ -115,6 +115,7 @@ def noisy(grid, level, seed=0):
     return hj.TensorField(grid, np.eye(2) + level * (white + np.swapaxes(white, -1, -2)) / 2)
 
 
+@pytest.mark.slow
 def test_noise_at_sides_corners_and_rims_is_like_that_inside():
     mask = np.ones((40, 40), bool)
     mask[:15, :15] = False
@@ -130,6 +131,7 @@ def test_noise_at_sides_corners_and_rims_is_like_that_inside():
         assert K[-4, 20:35].mean() < 1.2 * inside
 
 
+@pytest.mark.slow
 def test_curvature_that_is_noise_is_told():
     with pytest.warns(
         hj.AccuracyWarning, match=r"Gaussian curvature has an error of about 0\.0[89].* 0\.05.*smooth_tensors"
@@ -182,6 +184,7 @@ def test_rounding_of_the_third_coefficient_is_told():
     assert np.isnan(got[:6]).all()
 
 
+@pytest.mark.slow
 def test_curvature_is_differentiable_and_traceable():
     field = nodal(examples.sphere_field(10, 1.0))
 

@@ -20,7 +20,7 @@ def plane(grid):
 
 
 # The point is at a node, or in the middle of a cell.
-@pytest.mark.parametrize("n", [20, 21, pytest.param(40, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [20, *(pytest.param(n, marks=pytest.mark.slow) for n in (21, 40))])
 def test_the_papers_points(n):
     for index in INDICES:
         points = hj.degenerate_points(hj.examples.degenerate_point_field(index, n))
@@ -101,6 +101,7 @@ def test_near_points_merge_as_asked():
     assert sorted(hj.degenerate_points(pair, merge=6).indices) == [-0.5, 0.5]  # their sum is no point, but they are two
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("same", "distances"), [(False, (1.0, 1.5, 2.5, 3.5)), (True, (2.5, 3.5))])
 def test_near_pairs_are_found_at_random_places_and_angles(same, distances):
     grid, rng, trials = hj.Grid((20, 20)), np.random.default_rng(1), 40

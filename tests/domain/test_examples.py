@@ -64,6 +64,7 @@ def test_figure3_fields_are_the_papers():
     assert np.abs(hj.gaussian_curvature(fields["T⁴"])).max() > 0.1
 
 
+@pytest.mark.slow
 def test_figure4_fields_have_constant_eigenvalues():
     for name, field in examples.figure4_fields(9).items():
         values = np.linalg.eigvalsh(field.tensors)

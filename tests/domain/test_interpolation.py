@@ -26,13 +26,14 @@ def energy(grid):
     return value
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shape", "isotropic"),
     [
-        pytest.param((4, 5), True, marks=pytest.mark.slow),
+        ((4, 5), True),
         ((4, 5), False),
-        pytest.param((3, 4, 3), True, marks=pytest.mark.slow),
-        pytest.param((3, 4, 3), False, marks=pytest.mark.slow),
+        ((3, 4, 3), True),
+        ((3, 4, 3), False),
     ],
 )
 def test_gradient_agrees_with_differences(rng, shape, isotropic):
@@ -101,6 +102,7 @@ def test_nodes_outside_the_mask_have_no_influence_and_no_gradient(rng):
     np.testing.assert_array_equal(gradient[:3, :3], 0)
 
 
+@pytest.mark.slow
 def test_single_precision(rng):
     tensors = random_spd(rng, (5, 6))
     double = hj.assemble(hj.TensorField(hj.Grid((5, 6)), tensors, LOG)).stiffness.coefficients
@@ -123,6 +125,7 @@ def test_eigenvalues_of_turning_tensors_converge_at_second_order(way):
     assert (order < 2.4).all(), order
 
 
+@pytest.mark.slow
 def test_whatever_rebuilds_a_field_keeps_its_interpolation(rng):
     grid = hj.Grid((4, 5))
     D = random_spd(rng, (4, 5))

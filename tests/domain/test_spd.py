@@ -56,6 +56,7 @@ def test_large_and_small_exponents():
         np.testing.assert_allclose(got, np.exp(values), rtol=1e-12, atol=1e-12 * np.exp(max(values)))
 
 
+@pytest.mark.slow
 def test_second_derivatives_where_eigenvalues_are_equal():
     """exp(S + hD) = exp S (1 + hD + h²D²/2 + …) where S is a multiple of the identity."""
     D2, D3 = np.array([[0.3, 0.7], [0.7, -1.1]]), np.array([[0.3, 0.7, 0.1], [0.7, -1.1, 0.2], [0.1, 0.2, 0.5]])

@@ -39,6 +39,7 @@ def ring_eigenvalues(inner, outer, angle, count):
     return np.sort(found)[:count]
 
 
+@pytest.mark.slow
 def test_a_compatible_gradient_has_the_spectrum_of_the_deformed_body():
     """A rectangle (r, θ) bent to a quarter of a ring; F is the gradient of y = r (cos θ, sin θ)."""
     grid = hj.Grid.from_bounds((1, 0), (2, np.pi / 2), (24, 36))

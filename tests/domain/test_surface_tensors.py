@@ -52,11 +52,12 @@ def test_the_identity_is_the_metric_of_space(metric):
     np.testing.assert_allclose(got.metric, mesh.metric, rtol=1e-12, atol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("metric", "at"),
     [
-        pytest.param("inverse", "vertices", marks=pytest.mark.slow),
-        pytest.param("tensor", "faces", marks=pytest.mark.slow),
+        ("inverse", "vertices"),
+        ("tensor", "faces"),
         ("adjugate", "vertices"),
     ],
 )
@@ -77,6 +78,7 @@ def test_a_planar_square_converges_to_the_grid(metric, at):
     assert max(differences[1]) < 0.03
 
 
+@pytest.mark.slow
 def test_nothing_depends_on_how_the_surface_lies_in_space(rng):
     _, vertices, faces = square(5)
     vertices = vertices + 0.1 * rng.standard_normal(vertices.shape)

@@ -46,9 +46,7 @@ def dense_matrices(pencil):
     return np.asarray(pencil.stiffness.to_dense()), np.asarray(pencil.mass.to_dense())
 
 
-@pytest.mark.parametrize(
-    "name", [n if n in ("torus, lumped", "mixed, mask") else pytest.param(n, marks=pytest.mark.slow) for n in CASES]
-)
+@pytest.mark.parametrize("name", [n if n == "mixed, mask" else pytest.param(n, marks=pytest.mark.slow) for n in CASES])
 def test_products_in_columns_equal_the_operators(rng, name):
     pencil = problem(name)
     space = pencil.space
@@ -86,8 +84,8 @@ def test_a_metric_that_the_grid_hardly_resolves(boundary):
 @pytest.mark.parametrize(
     ("shape", "boundary"),
     [
-        ((6, 9), "neumann"),
-        ((7, 8), "periodic"),
+        pytest.param((6, 9), "neumann", marks=pytest.mark.slow),
+        pytest.param((7, 8), "periodic", marks=pytest.mark.slow),
         pytest.param((13, 10), "periodic", marks=pytest.mark.slow),
         ((6, 9), (("dirichlet", "neumann"), "periodic")),
         ((7, 8), (("dirichlet", "neumann"), "periodic")),
@@ -130,8 +128,8 @@ def test_the_compiler_computes_nothing_with_the_grid(name, masks):
 @pytest.mark.parametrize(
     ("shape", "boundary", "smaller"),
     [
-        ((40, 30, 20), "neumann", (24, 20, 16)),
-        ((40, 30, 20), "dirichlet", (24, 20, 16)),
+        pytest.param((40, 30, 20), "neumann", (24, 20, 16), marks=pytest.mark.slow),
+        pytest.param((40, 30, 20), "dirichlet", (24, 20, 16), marks=pytest.mark.slow),
         ((40, 30, 20), (("dirichlet", "neumann"), "periodic", ("neumann", "dirichlet")), (24, 30, 16)),
         ((60, 50), ("periodic", "neumann", "dirichlet"), (60, 32)),
         ((20, 18), "neumann", (20, 18)),
@@ -150,6 +148,7 @@ def test_a_cropped_grid_has_the_same_matrices(rng, shape, boundary, smaller):
     np.testing.assert_array_equal(pencil.space.null_labels, small.space.null_labels)
 
 
+@pytest.mark.slow
 def test_the_correction_is_the_polynomial_it_is_derived_from(rng):
     pencil = problem("torus, lumped")
     nodal = nodal_pencil(pencil)
@@ -284,6 +283,7 @@ def test_rounds_in_steps_give_the_same_and_say_what_is_left(monkeypatch):
     assert last.seconds_left > 0
 
 
+@pytest.mark.slow
 def test_what_is_left_of_rounds_that_converge_evenly(monkeypatch):
     """Four rounds of 10 s each divide the residual by ten; the last two filter half as many pairs."""
     clock = iter([0.0, 10.0, 20.0])

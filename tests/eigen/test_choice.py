@@ -51,10 +51,9 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=() if n == "block-lanczos" else pytest.mark.slow) for n in CASES]
-)
-@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_the_jitted_gradient_of_the_default_has_no_callback(monkeypatch, name, dtype):
     monkeypatch.setattr(automatic, "_SMALL", SMALL)
     function, shape, k = CASES[name]
@@ -114,6 +113,7 @@ def test_the_problems_of_a_doubled_domain_share_the_pairs(monkeypatch):
     assert choose_solver("auto", hj.assemble(field), 40).name == "block-lanczos"
 
 
+@pytest.mark.slow
 def test_on_accelerators_nothing_runs_on_the_host(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     plane = hj.assemble(flat((42, 41), (1.0, 1.0)))

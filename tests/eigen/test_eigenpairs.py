@@ -56,7 +56,9 @@ def test_second_order_convergence_to_the_exact_spectrum(boundary, lengths, mass)
     assert 1.7 < order < 2.3
 
 
-@pytest.mark.parametrize("boundary", ["neumann", "dirichlet", ("periodic", "neumann")])
+@pytest.mark.parametrize(
+    "boundary", ["dirichlet", *(pytest.param(b, marks=pytest.mark.slow) for b in ("neumann", ("periodic", "neumann")))]
+)
 def test_hks_converges_at_second_order_to_theta_sums(boundary):
     lengths, t = (1.0, 1.3), 0.05
     names = (boundary,) * 2 if isinstance(boundary, str) else boundary
@@ -84,9 +86,9 @@ def test_hks_converges_at_second_order_to_theta_sums(boundary):
     ("boundary", "mass"),
     [
         ("neumann", "consistent"),
-        ("dirichlet", "lumped"),
+        pytest.param("dirichlet", "lumped", marks=pytest.mark.slow),
         (("periodic", "neumann"), "lumped"),
-        ("mirror", "consistent"),
+        pytest.param("mirror", "consistent", marks=pytest.mark.slow),
         pytest.param("neumann", "lumped", marks=pytest.mark.slow),
         pytest.param("dirichlet", "consistent", marks=pytest.mark.slow),
         pytest.param(("periodic", "neumann"), "consistent", marks=pytest.mark.slow),
@@ -150,7 +152,7 @@ def test_nan_outside_the_mask_zero_on_dirichlet_nodes(rng):
     np.testing.assert_array_equal(functions[:, -1], 0)
 
 
-@pytest.mark.parametrize("solver", ["dense", "shift-invert"])
+@pytest.mark.parametrize("solver", [pytest.param("dense", marks=pytest.mark.slow), "shift-invert"])
 @pytest.mark.parametrize("boundary", ["dirichlet", pytest.param("mirror", marks=pytest.mark.slow)])
 def test_jit_and_vmap_give_the_looped_result(rng, solver, boundary):
     grid = hj.Grid((7, 8))

@@ -217,8 +217,14 @@ BOTTOMS = {  # a matrix, the number of copies of its lowest eigenvalue, a k that
 }
 
 
-@pytest.mark.parametrize("name", BOTTOMS)
-@pytest.mark.parametrize("solver", ["dense", "shift-invert", SOLVER])
+@pytest.mark.parametrize(
+    ("name", "solver"),
+    [
+        pytest.param(name, solver, marks=() if (i, j) in ((0, 1), (1, 0), (2, 2)) else pytest.mark.slow)
+        for i, name in enumerate(BOTTOMS)
+        for j, solver in enumerate(["dense", "shift-invert", SOLVER])
+    ],
+)
 def test_a_cut_lowest_eigenvalue_is_told(name, solver):
     """Its copies differ by rounding, of which no distance from the lowest of them tells."""
     made, copies, k = BOTTOMS[name]
@@ -239,8 +245,15 @@ def test_a_cut_lowest_eigenvalue_is_told(name, solver):
     np.testing.assert_allclose(hj.hks(other, [0.5])[0], hj.hks(whole, [0.5])[0][order], rtol=1e-9)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("solver", ["dense", SOLVER])
+@pytest.mark.parametrize(
+    ("solver", "dtype"),
+    [
+        ("dense", np.float32),
+        (SOLVER, np.float64),
+        pytest.param("dense", np.float64, marks=pytest.mark.slow),
+        pytest.param(SOLVER, np.float32, marks=pytest.mark.slow),
+    ],
+)
 def test_a_cut_lowest_eigenvalue_is_known_under_jit(solver, dtype):
     pencil = hj.sparse_pencil(paths(3, 12).astype(dtype))
 
@@ -282,6 +295,7 @@ def test_a_count_at_an_eigenvalue_of_a_doubled_domain_is_refused(boundary):
             assert hj.count_eigenvalues(pencil, beside) == (exact < beside).sum()
 
 
+@pytest.mark.slow
 def test_a_nearly_incompressible_body_is_located_by_few_factorisations(monkeypatch):
     """Its largest eigenvalue is 1e10 times as large as those wanted, of which rounding separates few from zero."""
     mesh = MeshTet.init_tensor(*(np.linspace(0, 1, 5),) * 3)
@@ -381,6 +395,7 @@ def test_a_vector_found_twice_has_not_converged(rng):
     np.testing.assert_array_equal(on_host[2], twice)
 
 
+@pytest.mark.slow
 def test_adjacency_matrices_in_float32():
     """Their diagonal is zero, which shows no level of rounding, and counts close to zero are uncertain."""
     links = np.triu(np.random.default_rng(3).random((300, 300)) < 0.2, 1)

@@ -45,6 +45,7 @@ def test_tensors_that_are_not_positive_definite_are_a_code_under_jit():
     np.testing.assert_array_equal(batch == hj.RESULTS.successful, [True, False])
 
 
+@pytest.mark.slow
 def test_a_failure_is_an_error_if_asked_for():
     run = partial(solve, solver=FEW, throw=True)
     with pytest.raises(RuntimeError, match="did not converge"):
@@ -65,9 +66,10 @@ def without_guards(solver):
 SOLVERS = [hj.BlockLanczos(), hj.ShiftInvert(), hj.ChebyshevFilter(block=8)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver",
-    [pytest.param(s, id=s.name, marks=() if isinstance(s, hj.ShiftInvert) else pytest.mark.slow) for s in SOLVERS],
+    [pytest.param(s, id=s.name) for s in SOLVERS],
 )
 def test_a_derivative_that_does_not_converge_is_told(solver):
     """The first four eigenvalues above zero of a flat torus are equal: a spectrum cut there has no derivative."""

@@ -97,6 +97,7 @@ def test_sphere_and_its_order():
     np.testing.assert_allclose(signature, series, rtol=5e-3)
 
 
+@pytest.mark.slow
 def test_disc_and_its_order():
     exact = np.sort([jn_zeros(0, 1)[0], *[jn_zeros(1, 1)[0]] * 2, *[jn_zeros(2, 1)[0]] * 2]) ** 2
     errors = {True: [], False: []}
@@ -119,6 +120,7 @@ def test_ball_and_its_order():
     assert orders(errors) > 3.2
 
 
+@pytest.mark.slow
 def test_derivative_by_the_places_of_nodes():
     """λ falls by the square of the length: x·∂λ/∂x = −2λ over vertices and middles (Euler)."""
     mesh = disc(1)

@@ -31,7 +31,8 @@ def square(x):
     return x @ x
 
 
-@pytest.mark.parametrize("d", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("d", [2, 3])
 def test_harmonic_oscillator(d):
     """−Δ + |x|² has the eigenvalues d + 2n, with the multiplicities of the monomials of degree n."""
     sizes, levels, errors = {2: (19, 37), 3: (9, 13)}[d], 3 if d == 2 else 2, []

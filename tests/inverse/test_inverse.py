@@ -259,6 +259,7 @@ def test_a_wave_kernel_signature():
         hj.fit_metric(FLAT, target, np.linspace(3, 9, 30), "conformal", data=Data(signature=wave_kernel(sigma)))
 
 
+@pytest.mark.slow
 def test_unobserved_entries_have_no_influence(rng):
     weights = (rng.uniform(size=(N, N)) > 0.3).astype(float)
     target, values = signature(CONFORMAL), jnp.asarray(rng.normal(0, 0.1, (N * N, 1)))

@@ -78,7 +78,7 @@ def test_single_vertices_beside_a_graph_do_not_turn_its_cuts():
     assert np.sum(level == 0) <= 20 * 1.2
 
 
-@pytest.mark.parametrize("name", ["components", "arrow"])
+@pytest.mark.parametrize("name", [pytest.param("components", marks=pytest.mark.slow), "arrow"])
 def test_products_with_a_few_long_rows(name, rng):
     matrix = GRAPHS[name](rng)
     operator = hj.sparse_pencil(matrix).stiffness
@@ -100,9 +100,7 @@ def test_tables_of_a_pattern_are_arguments_of_what_is_compiled(matrix, rng):
     np.testing.assert_array_equal(pencil.stiffness.diagonal(), matrix.diagonal())
 
 
-@pytest.mark.parametrize(
-    "name", [n if n in ("random", "components") else pytest.param(n, marks=pytest.mark.slow) for n in GRAPHS]
-)
+@pytest.mark.parametrize("name", [n if n == "random" else pytest.param(n, marks=pytest.mark.slow) for n in GRAPHS])
 def test_factorisation_of_any_pattern_solves_and_counts(name, rng):
     matrix = GRAPHS[name](rng)
     pencil = hj.sparse_pencil(matrix)

@@ -68,6 +68,7 @@ def test_the_least_degree_keeps_the_error_and_one_less_does_not():
     assert least_degree(0.0, 1e-8) == 1
 
 
+@pytest.mark.slow
 def test_bounds_on_the_top_of_a_spectrum(rng):
     values = rng.uniform(0, 5, 60)
     matrix, _ = symmetric(values, rng)

@@ -26,6 +26,7 @@ def without_the_first(x):
     return x.at[0].set(0)
 
 
+@pytest.mark.slow
 def test_rounding_in_a_negative_direction_is_taken_out(rng):
     """A preconditioner that errs there as by rounding: what the product makes of it grows from step to step."""
     values = definite_beyond_the_first(20, 3)
@@ -48,6 +49,7 @@ def test_a_singular_matrix_is_told_however_often_it_begins_again(rng):
     assert np.isnan(x).all()
 
 
+@pytest.mark.slow
 def test_residuals_of_pure_rounding_are_no_failure(rng):
     """Two eigenvalues: the third residual is rounding, and what the preconditioner makes of it may be negative."""
     values, rhs = np.repeat([1.0, 3.0], 10)[:, None], rng.standard_normal((20, 2))

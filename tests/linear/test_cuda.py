@@ -77,21 +77,20 @@ COMPUTATIONS = {
 DIFFERENTIATED = ["dense", "block Lanczos", "filter", "mirror", "surface", "colouring", "selected inversion", "batch"]
 
 
-def cases(names):
-    """All slow but the first."""
-    return [names[0], *(pytest.param(name, marks=pytest.mark.slow) for name in names[1:])]
-
-
 def lowered(function, example):
     return export.export(jax.jit(function), platforms=["cuda"])(jax.ShapeDtypeStruct(example.shape, example.dtype))
 
 
-@pytest.mark.parametrize("name", cases(list(COMPUTATIONS)))
+FIRST, *OTHERS = COMPUTATIONS
+
+
+@pytest.mark.parametrize("name", [FIRST, *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)])
 def test_values_are_lowered(name):
     assert lowered(*COMPUTATIONS[name]).platforms == ("cuda",)
 
 
-@pytest.mark.parametrize("name", cases(DIFFERENTIATED))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DIFFERENTIATED)
 def test_gradients_are_lowered(name):
     function, example = COMPUTATIONS[name]
     gradient = jax.grad(lambda x: jnp.nansum(function(x) ** 2))

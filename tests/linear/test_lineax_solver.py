@@ -59,7 +59,8 @@ def test_solutions_transposes_and_conjugates(rng, kind):
     np.testing.assert_allclose(SOLVER.compute(state, b, options)[0], np.linalg.solve(matrix.conj().T, b), atol=1e-10)
 
 
-@pytest.mark.parametrize("kind", ["real", pytest.param("hermitian", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["real", "hermitian"])
 def test_derivatives_under_vmap_of_first_and_second_order(rng, kind):
     """By operator and vector, beside those of `jnp.linalg.solve`."""
     matrices, changes = (jnp.asarray([matrix_of(kind, rng) for _ in range(3)]) for _ in range(2))
@@ -127,6 +128,7 @@ def test_vectors_that_are_trees_and_operators_on_them():
     np.testing.assert_allclose(x["b"], 0.5)
 
 
+@pytest.mark.slow
 def test_what_lineax_asks_of_a_sparse_operator(rng):
     operator = hj.SparseLinearOperator(indefinite(7)[0], 0.1)
     matrix, x = operator.as_matrix(), jnp.asarray(rng.standard_normal(7))

@@ -105,6 +105,7 @@ def test_third_derivatives_are_refused():
         along(along(along(lambda A: hj.matrix_function(A, jnp.exp))))(jnp.eye(2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("double", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_of_a_pencil_it_is_f_of_the_quotient_times_the_inverse(rng, double):
     """f(B⁻¹A) B⁻¹ = B^(−½) f(B^(−½) A B^(−½)) B^(−½), here with A of three equal eigenvalues against B."""
@@ -153,6 +154,7 @@ def test_parameters_of_f_batched_compute_one_decomposition(rng):
     np.testing.assert_allclose(gradient, np.stack([2 * A, 12 * A @ A]), atol=1e-11)
 
 
+@pytest.mark.slow
 def test_shared_out_to_devices(rng):
     """One device will do; functions that close over an array, too."""
     stack, t = jnp.asarray([with_spectrum(rng, SPECTRA["multiple"])] * 2), jnp.asarray(0.3)
@@ -192,7 +194,7 @@ def decimal_tanh(x):
         pytest.param(jnp.tanh, decimal_tanh, id="tanh", marks=pytest.mark.slow),
     ],
 )
-@pytest.mark.parametrize("scale", [1, 30])
+@pytest.mark.parametrize("scale", [pytest.param(1, marks=pytest.mark.slow), 30])
 def test_second_divided_differences(f, exact, scale):
     """Against the quotients in 60 digits where all three are apart or close, and f''/2 where they are equal."""
     getcontext().prec = 60

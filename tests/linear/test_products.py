@@ -41,6 +41,7 @@ def test_functions_of_each_row_and_what_belongs_to_them_in_derivatives(rng, coun
     np.testing.assert_allclose(of_rows, np.roll(factors * images, -1, axis=1), rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_a_transpose_of_ones_own_is_differentiated_by_what_its_cotangents_depend_on(rng):
     """What `jax.jacfwd` of `jax.grad` takes, for the parameters of a loss."""
     A, x = jnp.asarray(rng.standard_normal((3, 4))), jnp.asarray(rng.standard_normal(4))

@@ -30,7 +30,7 @@ def test_values(rng, shape, dtype):
     np.testing.assert_allclose(got, expected, atol=20 * np.finfo(dtype).eps * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("shape", [pytest.param(SHAPES[0], marks=pytest.mark.slow), *SHAPES[1:3]])
+@pytest.mark.parametrize("shape", [SHAPES[1], *(pytest.param(SHAPES[i], marks=pytest.mark.slow) for i in (0, 2))])
 def test_transpose(rng, shape):
     """Of symmetric matrices: the transpose may have their upper triangle alone, twice."""
     matrices, vectors, matters = problem(rng, shape)
@@ -54,6 +54,7 @@ def test_rows_that_do_not_matter_are_left_out(rng):
     np.testing.assert_array_equal(got[1], 0)
 
 
+@pytest.mark.slow
 def test_under_jit_and_vmap(rng):
     problems = [problem(rng, (3, 70, 30)) for _ in range(2)]
     batch = jax.tree.map(lambda *x: jnp.stack(x), *problems)

@@ -60,7 +60,7 @@ def entries_and_dense(pencil, shift=POLE):
 
 
 @pytest.mark.parametrize(
-    "name", [n if n in ("slot", "few nodes", "volume") else pytest.param(n, marks=pytest.mark.slow) for n in DOMAINS]
+    "name", [n if n in ("slot", "few nodes") else pytest.param(n, marks=pytest.mark.slow) for n in DOMAINS]
 )
 def test_it_is_the_diagonal_of_the_dense_inverse(name):
     pencil = hj.assemble(*DOMAINS[name]())
@@ -71,6 +71,7 @@ def test_it_is_the_diagonal_of_the_dense_inverse(name):
     np.testing.assert_allclose(found, expected, atol=1e-12 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_real_definite_matrices_and_single_precision():
     pencil = hj.assemble(*DOMAINS["square"]())
     tree = dissect(pencil.pattern)

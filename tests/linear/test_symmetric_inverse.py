@@ -60,6 +60,7 @@ def test_no_pivot_is_smaller_than_the_least_allowed(way):
     np.testing.assert_allclose(inverted[0], np.diag([1 / 3, 1e3, -0.5, 1e3]), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_elimination_under_vmap(rng):
     a = rng.standard_normal((2, 3, 20, 20))
     a = a + np.swapaxes(a, 2, 3)

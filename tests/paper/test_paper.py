@@ -219,6 +219,7 @@ def one_colour_range(images):
     assert [image.get_clim() for image in images] == [ends] * len(images)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("cheap")
 def test_figure_3_has_ellipses_over_images(tmp_path, drawn, monkeypatch):
     fig = draw("figure3", tmp_path, drawn, monkeypatch)

@@ -104,6 +104,7 @@ def test_texture_ends_at_the_mask_and_isotropic_noise_stays():
         plot.lic_texture(field, pixels=1)
 
 
+@pytest.mark.slow
 def test_shading_keeps_the_mean_colour_and_the_grain_its_size_on_paper():
     field = hj.examples.figure4_fields(21)["cells"]
     ax = axes()

@@ -17,9 +17,9 @@ RegionStatistics Signature Step SymmetricPencil Truncation Uncertainty hks_jax.L
 NO_CALL = "AccuracyWarning RESULTS REPAIRS ORDERS UNITS examples"  # codes, choices, and a module
 SLOW = """
 ChebyshevFilter Data FactorisedAdjoint FilteredAdjoint Free H1 HostAdjoint Multifrontal Search TensorField TensorNoise
-TotalVariation ball_mesh boundary_influence count_eigenvalues eigsh factorise fit_metric fit_panels
-gaussian_curvature heat_flow hks_auto hks_expansion hks_spectrum_free identifiability log_determinant phantom
-smooth_tensors uncertainty varadhan_distance
+TotalVariation ball_mesh boundary_influence count_eigenvalues degenerate_point_field eigsh factorise fit_metric
+fit_panels gaussian_curvature heat_flow hks_auto hks_expansion hks_spectrum_free identifiability log_determinant phantom
+scalar_curvature smooth_tensors uncertainty varadhan_distance
 """  # long for the compiler, above all fits
 NEEDS = {"isosurfaces": "pyvista", "fit_dwi": "dipy", "read_mesh": "meshio", "read_mesh_arrays": "meshio"}
 

@@ -176,7 +176,7 @@ def test_eigenvalues_far_below_the_largest_are_accurate():
     np.testing.assert_allclose(pairs.eigenvalues[1], 1e-6, rtol=2e-6)
 
 
-@pytest.mark.parametrize(("n", "solver"), [(33, "dense"), (65, "shift-invert")])
+@pytest.mark.parametrize(("n", "solver"), [pytest.param(33, "dense", marks=pytest.mark.slow), (65, "shift-invert")])
 def test_a_small_potential_raises_the_lowest_eigenvalue(n, solver):
     for potential in (0.01, 0.1, 1.0):
         pairs, told = told_by(lambda V=potential: hj.eigenpairs(hj.assemble(square(n), potential=V), 4, solver=solver))
@@ -203,6 +203,7 @@ def test_eigenvalues_that_float32_does_not_hold_are_told():
     np.testing.assert_allclose(pairs.eigenvalues, exact, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_under_jit_an_eigenvalue_near_zero_has_a_code():
     K = hj.sparse_pencil(cliques(1e-5))
     pairs = jax.jit(lambda K: hj.eigenpairs(K, 2))(K)

@@ -45,6 +45,7 @@ def test_heat_flow_is_the_matrix_exponential(field, boundary, k, rng):
     np.testing.assert_allclose(several, np.stack([flow, 2 * flow], axis=1)[:, None])
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_truncated_flow(field, rng):
     weights = np.where(field.grid.inside, rng.standard_normal((2, *SHAPE)), 0)
     start = {"tensors": field.tensors, "times": jnp.asarray(TIMES), "u": jnp.asarray(rng.standard_normal(SHAPE))}

@@ -73,6 +73,7 @@ def test_flat_tori_and_rectangles(values, rim, expected):
     assert found.error < 1e-4
 
 
+@pytest.mark.slow
 def test_the_sphere_with_powers_that_are_extrapolated_or_known():
     """½ − 4ζ′(−1)."""
     degrees = np.arange(21)

@@ -290,7 +290,8 @@ def coefficients(tensors, f):
     return hj.decompose(pairs, f), hj.energy(pairs, f).energy
 
 
-@pytest.mark.parametrize("unmeasured", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("unmeasured", [False, True])
 def test_derivatives_of_coefficients(unmeasured, rng):
     f = rng.standard_normal(SHAPE)
     if unmeasured:
@@ -367,6 +368,7 @@ def square_pairs(k=11):
     return hj.eigenpairs(flat((8, 8), (1.0, 1.0)), k, solver="dense", multiplet="drop")
 
 
+@pytest.mark.slow
 def test_surrogates_keep_the_energy_of_each_multiplet_and_correlate_as_theory_says(rng):
     pairs = square_pairs()
     labels = np.asarray(pairs.multiplets)

@@ -63,7 +63,7 @@ def test_the_estimate_has_the_influence_of_a_round_rim():
     assert float(hj.default_times(one, 3)[-1] / hj.default_times(one, 3)[0]) == pytest.approx(2)
 
 
-@pytest.mark.parametrize("boundary", [("mean", "periodic"), STRIP[0]])
+@pytest.mark.parametrize("boundary", [pytest.param(("mean", "periodic"), marks=pytest.mark.slow), STRIP[0]])
 def test_default_times_end_where_half_of_the_nodes_are_free(strip, boundary):
     """In a strip of width 1, half of the nodes are farther than 1/4 from the sides: exp(−1/16t) = 1/10."""
     pairs = hj.eigenpairs(strip, 60, boundary, solver="dense", multiplet="drop")
@@ -88,6 +88,7 @@ def test_without_a_boundary_the_spectrum_ends_the_times():
         assert not np.asarray(hj.boundary_influence(pairs, [1.0])).any()
 
 
+@pytest.mark.slow
 def test_default_times_are_the_same_when_traced(strip):
     def last(tensors):
         pairs = hj.eigenpairs(hj.TensorField(strip.grid, tensors), 40, STRIP[0], solver="dense", multiplet="drop")

@@ -85,6 +85,7 @@ def test_wks_is_a_weighted_mean_of_squares(pairs):
     np.testing.assert_allclose(far, functions[0] ** 2, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_scale_invariance(field, pairs):
     scaled = hj.eigenpairs(hj.TensorField(field.grid, 9.0 * field.tensors), pairs.k)
     np.testing.assert_allclose(hj.scale_invariant_hks(scaled), hj.scale_invariant_hks(pairs), rtol=1e-8, atol=1e-12)
@@ -167,6 +168,7 @@ def test_the_tail_for_any_exponent(least, rtol):
     np.testing.assert_allclose(tail, incomplete_gamma(a, x), rtol=rtol)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shape", "boundary", "spread"),
     [
@@ -223,6 +225,7 @@ def test_medians_by_bisection_are_those_of_sorting(rng, dtype, xp):
     np.testing.assert_array_equal(np.isnan(median_of_shares(xp, xp.asarray(padded), free)), np.arange(5) == 1)
 
 
+@pytest.mark.slow
 def test_resolution_bias_bounds_the_discretisation_error():
     # The exact HKS of a flat torus is 1/4πt times a theta function which is 1 to 1e-10 here.
     for mass in ("consistent", "lumped"):
@@ -239,8 +242,8 @@ def test_resolution_bias_bounds_the_discretisation_error():
     [
         pytest.param("linear", 2, 21, 3, 1.0, marks=pytest.mark.slow),
         pytest.param("log-euclidean", 2, 21, 3, 1.0, marks=pytest.mark.slow),
-        ("linear", 2, 21, 10, 1.0),
-        ("log-euclidean", 2, 21, 10, 1.0),
+        pytest.param("linear", 2, 21, 10, 1.0, marks=pytest.mark.slow),
+        pytest.param("log-euclidean", 2, 21, 10, 1.0, marks=pytest.mark.slow),
         pytest.param("linear", 2, 15, 10, 0.4, marks=pytest.mark.slow),
         pytest.param("log-euclidean", 2, 15, 10, 0.4, marks=pytest.mark.slow),
         ("linear", 3, 7, 3, 1.0),

@@ -244,7 +244,8 @@ def test_traced_values_need_settings_and_settings_must_fit():
         jax.grad(jax.grad(lambda s: loss(s, method=settings)))(1.0)
 
 
-@pytest.mark.parametrize("method", [pytest.param("selected-inversion", marks=pytest.mark.slow), "colouring"])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["selected-inversion", "colouring"])
 def test_amplified_errors_give_nan(method):
     """Errors grow as exp(−vt) with the least potential v; for a constant potential the signature grows as fast."""
     field = flat((8, 7), (1.4, 1.2))
@@ -364,6 +365,7 @@ def test_auto_on_a_mesh_and_in_a_volume():
         assert float(found.overlap_difference) < 1e-4
 
 
+@pytest.mark.slow
 def test_a_volume_too_large_for_selected_inversion_is_left_to_colouring(monkeypatch):
     """Decided by the number of nodes alone: to dissect them would take long."""
     pencil, times = hj.assemble(flat((9, 10, 11), (1.0, 1.0, 1.0)), mass="lumped"), jnp.array([0.01])

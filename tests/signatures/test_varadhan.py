@@ -37,6 +37,7 @@ def test_flat_distances_and_why_they_are_normalised(torus):
     np.testing.assert_allclose(raw[:, near] ** 2 - unit[:, None], ours[:, near] ** 2, atol=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::hks_jax.AccuracyWarning")
 def test_what_is_not_resolved_is_nan_and_said(torus):
     pairs, exact = torus

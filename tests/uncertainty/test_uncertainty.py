@@ -71,6 +71,7 @@ def test_numbers_are_exact(rng):
     np.testing.assert_allclose(bars.deviation, np.linalg.norm(np.ravel(g) @ J), rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_the_derivative_by_the_noise_says_which_measurement_matters(rng):
     D = random_spd(rng, (5, 4), 0.2)
 
@@ -126,6 +127,7 @@ def test_bias_and_departure_from_linearity_of_a_quadratic_are_exact(rng):
     assert 0.8 < part < 1
 
 
+@pytest.mark.slow
 def test_noise_of_modes_is_shared_as_they_are(rng):
     # A mode that all nodes share does not average out in the mean over nodes; independent noise does.
     grid, D = hj.Grid((20, 20)), np.tile(np.eye(2), (20, 20, 1, 1))
@@ -249,16 +251,15 @@ def compared_with_the_truth(bars, truth):
     return [*errors, (a < truth) & (truth < b), (c < truth) & (truth < d)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("field", "level", "number", "old"),
     [
         (TORUS, 0.03, 8, 0.35),
-        pytest.param(DISC, 0.05, 8, 0.3, marks=pytest.mark.slow),
-        pytest.param(
-            flat_torus(12, 60, np.array([0.5, 2.0, 8.0]), ((1.6, 0.5), (0.5, 0.6))), 0.03, 8, 0, marks=pytest.mark.slow
-        ),
-        pytest.param(LARGE_TORUS, 0.03, 8, 0.4, marks=pytest.mark.slow),
-        pytest.param(LARGE_TORUS, 0.1, 8, 0.1, marks=pytest.mark.slow),
+        (DISC, 0.05, 8, 0.3),
+        (flat_torus(12, 60, np.array([0.5, 2.0, 8.0]), ((1.6, 0.5), (0.5, 0.6))), 0.03, 8, 0),
+        (LARGE_TORUS, 0.03, 8, 0.4),
+        (LARGE_TORUS, 0.1, 8, 0.1),
     ],
     ids=["torus", "disc", "anisotropic", "torus 22, 3 %", "torus 22, 10 %"],
 )
