@@ -186,69 +186,11 @@ def draw(name, tmp_path, drawn, monkeypatch, size=None, time=None):
     return fig
 
 
-@pytest.mark.usefixtures("cheap")
-@pytest.mark.slow
-def test_figure_1_shows_a_surface_and_its_chart(tmp_path, drawn, monkeypatch):
-    fig = draw("figure1", tmp_path, drawn, monkeypatch, size=(60, 10))
-    assert [ax.name for ax in fig.axes[:4]] == ["3d", "3d", "rectilinear", "rectilinear"]
-    surface = bumpy_torus_mesh(20)
-    for ax in fig.axes[:2]:
-        assert len(ax.collections[0].get_facecolor()) == len(surface.faces)
-    assert len(fig.axes[2].collections[0].get_offsets()) > 400
-    assert fig.axes[3].images[0].get_array().shape == (60, 60)
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("cheap")
-def test_figure_2_has_three_boundaries_and_profiles_for_two_metrics(tmp_path, drawn, monkeypatch):
-    fig = draw("figure2", tmp_path, drawn, monkeypatch, size=41)
-    assert [len(ax.images) for ax in fig.axes] == [1, 1, 1, 1, 0] * 2
-    assert [line.get_label() for line in fig.axes[4].lines] == ["natural", "strip", "mirror", "expansion"]
-    natural, before, strip = (fig.axes[i].images[0].get_array() for i in range(3))
-    # The reflected strip, 12 nodes wide, is cropped to the same nodes; the dashed square shows which.
-    assert before.shape == (65, 65)
-    np.testing.assert_allclose(before[12:-12, 12:-12], strip)
-    np.testing.assert_allclose(strip, natural)
-    assert fig.axes[1].patches[0].get_bbox().bounds == (0, 0, 1, 1)
-
-
 def one_colour_range(images):
     """All images of a figure have the same colours for the same values, and these span all values."""
     arrays = [image.get_array() for image in images]
     ends = min(array.min() for array in arrays), max(array.max() for array in arrays)
     assert [image.get_clim() for image in images] == [ends] * len(images)
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("cheap")
-def test_figure_3_has_ellipses_over_images(tmp_path, drawn, monkeypatch):
-    fig = draw("figure3", tmp_path, drawn, monkeypatch)
-    assert [len(ax.collections) for ax in fig.axes] == [1] * 4 + [0] * 4
-    assert [len(ax.images) for ax in fig.axes] == [0] * 4 + [1] * 4
-    one_colour_range([ax.images[0] for ax in fig.axes[4:]])
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("cheap")
-def test_figure_4_has_lines_over_every_field(tmp_path, drawn, monkeypatch):
-    fig = draw("figure4", tmp_path, drawn, monkeypatch, size=31)
-    n = len(figure4_fields(5))
-    assert len(fig.axes) == 2 * n
-    for top, bottom in zip(fig.axes[:n], fig.axes[n:], strict=True):
-        assert [len(lines.get_segments()) > 5 for lines in top.collections] == [True, True]
-        assert len(bottom.collections[0].get_segments()) > 5
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("cheap")
-def test_figure_5_has_all_indices(tmp_path, drawn, monkeypatch):
-    fig = draw("figure5", tmp_path, drawn, monkeypatch, size=31)
-    *panels, bar = fig.axes
-    titles = [ax.get_title() for ax in panels]
-    assert titles == [f"index {i}" for i in ("−2", "−3/2", "−1", "−1/2", "1/2", "1", "3/2", "2", "5/2", "3")]
-    assert all(len(ax.collections[0].get_segments()) > 10 for ax in panels)
-    assert "HKS" in bar.get_ylabel()
-    one_colour_range([ax.images[0] for ax in panels])
 
 
 @pytest.mark.slow
@@ -282,6 +224,11 @@ def test_signature_and_enough_pairs(monkeypatch):
 @pytest.mark.slow
 def test_figure_1_shows_the_same_hks_on_surface_and_chart(tmp_path, drawn, monkeypatch):
     fig = draw("figure1", tmp_path, drawn, monkeypatch, size=(100, 60), time=4.0)
+    assert [ax.name for ax in fig.axes[:4]] == ["3d", "3d", "rectilinear", "rectilinear"]
+    surface = bumpy_torus_mesh(20)
+    for ax in fig.axes[:2]:
+        assert len(ax.collections[0].get_facecolor()) == len(surface.faces)
+    assert len(fig.axes[2].collections[0].get_offsets()) > 400
     on_chart = fig.axes[3].images[0].get_array()
     (on_surface,) = signature(bumpy_torus_mesh(100), [4.0], 60)
     np.testing.assert_allclose(on_chart.T, on_surface.reshape(100, 100), rtol=0.05)
@@ -290,7 +237,12 @@ def test_figure_1_shows_the_same_hks_on_surface_and_chart(tmp_path, drawn, monke
 @pytest.mark.slow
 def test_figure_2_shows_the_boundary_and_its_removal(tmp_path, drawn, monkeypatch):
     fig = draw("figure2", tmp_path, drawn, monkeypatch, size=31)
+    assert [len(ax.images) for ax in fig.axes] == [1, 1, 1, 1, 0] * 2
+    assert [line.get_label() for line in fig.axes[4].lines] == ["natural", "strip", "mirror", "expansion"]
     natural, before, strip, mirror = (fig.axes[i].images[0].get_array() for i in range(4))
+    # The reflected strip, 9 nodes wide, is cropped to the same nodes; the dashed square shows which.
+    assert before.shape == (49, 49)
+    assert fig.axes[1].patches[0].get_bbox().bounds == (0, 0, 1, 1)
     assert before.max() == pytest.approx(4, rel=0.05)
     np.testing.assert_allclose(before[9:-9, 9:-9], strip)
     assert natural.max() == pytest.approx(4, rel=0.05)  # a corner
@@ -305,10 +257,17 @@ def test_figure_2_shows_the_boundary_and_its_removal(tmp_path, drawn, monkeypatc
 @pytest.mark.slow
 def test_figures_3_and_4_see_which_fields_are_flat(tmp_path, drawn, monkeypatch):
     fig = draw("figure3", tmp_path, drawn, monkeypatch)
+    assert [len(ax.collections) for ax in fig.axes] == [1] * 4 + [0] * 4
+    assert [len(ax.images) for ax in fig.axes] == [0] * 4 + [1] * 4
+    one_colour_range([ax.images[0] for ax in fig.axes[4:]])
     spread = [float(np.ptp(ax.images[0].get_array())) for ax in fig.axes[4:]]
     assert spread[0] < 0.02
     assert min(spread[1:]) > 0.1
     fig = draw("figure4", tmp_path, drawn, monkeypatch)
+    assert len(fig.axes) == 2 * len(figure4_fields(5)) == 10
+    for top, bottom in zip(fig.axes[:5], fig.axes[5:], strict=True):
+        assert [len(lines.get_segments()) > 5 for lines in top.collections] == [True, True]
+        assert len(bottom.collections[0].get_segments()) > 5
     spread = [float(np.ptp(ax.images[0].get_array())) for ax in fig.axes[5:]]
     assert max(spread[:3]) < 0.1 * min(spread[3:])  # straight, circles and spirals; waves and cells
 
@@ -316,7 +275,13 @@ def test_figures_3_and_4_see_which_fields_are_flat(tmp_path, drawn, monkeypatch)
 @pytest.mark.slow
 def test_figure_5_has_the_symmetries_of_its_fields(tmp_path, drawn, monkeypatch):
     fig = draw("figure5", tmp_path, drawn, monkeypatch, size=31)
-    images = {ax.get_title(): ax.images[0].get_array().T for ax in fig.axes if ax.images}
+    *panels, bar = fig.axes
+    titles = [ax.get_title() for ax in panels]
+    assert titles == [f"index {i}" for i in ("−2", "−3/2", "−1", "−1/2", "1/2", "1", "3/2", "2", "5/2", "3")]
+    assert all(len(ax.collections[0].get_segments()) > 10 for ax in panels)
+    assert "HKS" in bar.get_ylabel()
+    one_colour_range([ax.images[0] for ax in panels])
+    images = {title: ax.images[0].get_array().T for title, ax in zip(titles, panels, strict=True)}
     # The field of index i is the same after a turn by 2π/|2i − 2|; those of a quarter turn are nodes again.
     for index in ("−1", "3"):
         image = images[f"index {index}"]
