@@ -83,8 +83,8 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
     solved = _on_mesh(args, progress) if is_mesh(args.file) else _on_grid(args, progress)
     place, pairs, maps = solved.place, solved.pairs, None
-    if pairs.part is not None:
-        odd = int((np.asarray(pairs.part) > 0).sum())
+    if len(pairs.problems) > 1:
+        odd = int((np.asarray(pairs.problem_numbers) > 0).sum())
         progress.note(
             f"{odd} of {pairs.k} modes are odd, and maps have no part in them; --boundary neumann has no odd modes"
         )

@@ -127,34 +127,21 @@ def shapes(contraction: Contraction, filters: Filter, pairs: tuple[Array, Array,
 
 def by_numpy(known: SimpleNamespace, x: SimpleNamespace | None, y: list[Any] | None) -> Any:
     """Compute the derivative of a kernel's diagonal, or its transpose, with NumPy; return None if JAX should."""
-    filters, selection, copies, space = known.filters, known.selection, known.copies, known.space
-    values, vectors, kept = map(np.asarray, known.pairs)
-    k = len(values) if selection is None else len(selection[0])
-    m = len(jax.tree.leaves(filters)[0])
-    plain = isinstance(known.contraction, Diagonal) and known.reader is None and k > 0
+    filters, (values, vectors, kept) = known.filters, map(np.asarray, known.pairs)
+    k, m = len(values), len(jax.tree.leaves(filters)[0])
+    plain = isinstance(known.contraction, Diagonal) and known.reader is None
     if x is None or not plain or vectors.size > _ON_HOST or m * k * k > _ON_HOST:
         return None
-    rows: Any = slice(None)
-    if selection is not None:
-        rows, own = map(np.asarray, selection)
-        values, kept, vectors = values[rows], kept[rows], np.where(own[:, None], vectors[rows], 0)
-    weights, of_f, of_lambda_f, matters = map(
-        np.asarray, mixing(filters, jax.device_put(values), jax.device_put(kept), known.fixed)
-    )
+    weights, of_f, of_lambda_f, matters = map(np.asarray, mixing(filters, known.pairs[0], known.pairs[2], known.fixed))
     change = x.change
     # For each filter, the matrix entry (i, j) is negligible unless i < n or j < n. The matrices are symmetric, so a sum
     # over i < n and all j is enough, if its terms with j ≥ n count twice.
     last = [int(np.max(np.flatnonzero(one), initial=-1)) + 1 for one in matters]
     times = [np.where(np.arange(k) < n, 1, 2) for n in last]
-
-    def transferred(functions: np.ndarray, of: FunctionSpace, to: FunctionSpace) -> np.ndarray:
-        return np.asarray(of.transfer(jax.device_put(functions), to))
-
-    moved = transferred(vectors, space, change.space)
     if y is None:
-        images = ((matrix.to_scipy() @ moved.T).T for matrix in (change.stiffness, change.mass))
-        stiffness, mass = (copies * transferred(each, change.space, space) @ vectors.T for each in images)
-        d_frame = np.where(kept[:, None], np.asarray(x.d_frame)[rows], 0)
+        images = ((matrix.to_scipy() @ vectors.T).T for matrix in (change.stiffness, change.mass))
+        stiffness, mass = (each @ vectors.T for each in images)
+        d_frame = np.where(kept[:, None], np.asarray(x.d_frame), 0)
         result = weights @ (2 * vectors * d_frame)
         for one, (n, count) in enumerate(zip(last, times, strict=True)):
             matrix = (of_f[one] * stiffness - of_lambda_f[one] * mass)[:n] * count
@@ -166,7 +153,5 @@ def by_numpy(known: SimpleNamespace, x: SimpleNamespace | None, y: list[Any] | N
         outer = (vectors[:n] * y[0][one]) @ vectors.T * count
         stiffness[:n] += of_f[one, :n] * outer
         mass[:n] -= of_lambda_f[one, :n] * outer
-    d_frame = np.zeros(x.d_frame.shape, x.d_frame.dtype)
-    d_frame[rows] = np.where(kept[:, None], 2 * vectors * (weights.T @ y[0]), 0)
-    images = (transferred(copies * each @ vectors, space, change.space) for each in (stiffness, mass))
-    return {"d_frame": d_frame, "change": change_of(change, moved, *images)}
+    d_frame = np.where(kept[:, None], 2 * vectors * (weights.T @ y[0]), 0)
+    return {"d_frame": d_frame, "change": change_of(change, vectors, stiffness @ vectors, mass @ vectors)}
