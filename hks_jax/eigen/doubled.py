@@ -54,7 +54,7 @@ class DoubledEigenpairs(Eigenpairs, eqx.Module):
 
     # An eigenfunction has norm 1 on the domain doubled m times, hence norm 1/√2ᵐ on the domain itself. The values at
     # the free nodes of the even problem, which has all free nodes, are 0 at Dirichlet nodes of the other problems.
-    def _functions(self, of_problems: Sequence[Float[Array, "ki ni"]]) -> Float[Array, "k n_dof"]:
+    def _functions(self, of_problems: Sequence[Float[Array, "_k _n"]]) -> Float[Array, "k n_dof"]:
         rows = [each.space.transfer(own, self.space) for each, own in zip(self.problems, of_problems, strict=True)]
         return _in_order(rows, self._spectra, self.including, self.k, -2) / math.sqrt(len(rows))
 
@@ -109,7 +109,7 @@ class DoubledEigenpairs(Eigenpairs, eqx.Module):
         return self.with_problems(each.keeping(mask) for each, mask in zip(self.problems, own, strict=True))
 
     @property
-    def _spectra(self) -> list[Float[Array, " ki"]]:
+    def _spectra(self) -> list[Float[Array, " _k"]]:
         return [each.eigenvalues for each in self.problems]
 
 
