@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from hks_jax.compilation import jit_quickly, numpy_where_known
+from hks_jax.compilation import numpy_where_known
 from hks_jax.eigen.adjoints.complement import OfRows, Rows, Scalar, Values
 from hks_jax.eigen.quality import indistinct
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.linear_map import first_order_only, with_transpose
+from hks_jax.linear.linear_program import linear_program
 from hks_jax.linear.products import even_size, inner_products, matmul, row_blocks
 
 _ROWS = 128
@@ -37,14 +38,10 @@ def with_rotations(frame: Rows, values: Values, pencil: Pencil) -> Rows:
 @with_rotations.defjvp
 def _with_rotations_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     frame, values, pencil = first_order_only(primals)
-    return frame, tangents[0] + _rotations(frame, values, indistinct(pencil, values.dtype), tangents[2])
+    known = frame, values, indistinct(pencil, values.dtype)
+    return frame, tangents[0] + linear_program(_rotations, (), known, tangents[2], frame)
 
 
-def _shape(frame: Rows, *args: Any) -> Any:
-    return jax.ShapeDtypeStruct(frame.shape, frame.dtype)
-
-
-@jit_quickly(linear=("change",), shapes=_shape)
 @jax.checkpoint
 def _rotations(frame: Rows, values: Values, rounding: Scalar, change: Pencil) -> Rows:
     stiffness, mass = changes_between(frame, change)

@@ -3,7 +3,6 @@
 from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
-from types import SimpleNamespace
 from typing import Any
 
 import equinox as eqx
@@ -14,8 +13,11 @@ from jaxtyping import Array, Bool, Float
 
 from hks_jax.arrays import StaticArray
 from hks_jax.eigen.derivative import change_of
+from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import FunctionSpace
+from hks_jax.linear.linear_program import HostMap
 from hks_jax.linear.products import quadratic_forms
+from hks_jax.linear.symmetric_pencil import SymmetricPencil
 from hks_jax.signatures.filters import Filter, mixing
 
 _matmul = partial(jnp.matmul, precision="highest")
@@ -119,39 +121,44 @@ class SquaredDistances(_FromSources):
         return jnp.moveaxis(readings, 0, 1)
 
 
-def shapes(contraction: Contraction, filters: Filter, pairs: tuple[Array, Array, Array], *args: Any) -> Any:
-    """Return the shape and dtype of the derivative."""
-    vectors, m = pairs[1], len(jax.tree.leaves(filters)[0])
-    return jax.eval_shape(contraction.weighted, jax.ShapeDtypeStruct((m, len(vectors)), vectors.dtype), vectors)
-
-
-def by_numpy(known: SimpleNamespace, x: SimpleNamespace | None, y: list[Any] | None) -> Any:
-    """Compute the derivative of a kernel's diagonal, or its transpose, with NumPy; return None if JAX should."""
-    filters, (values, vectors, kept) = known.filters, map(np.asarray, known.pairs)
+def by_numpy(
+    fixed: bool,
+    contraction: Contraction,
+    filters: Filter,
+    values: Float[Array, " k"],
+    vectors: Float[Array, "k n_dof"],
+    kept: Bool[Array, " k"],
+    reader: Any,
+) -> HostMap | None:
+    """Return the derivative of a kernel's diagonal by NumPy; None for other kernels, and for large ones."""
     k, m = len(values), len(jax.tree.leaves(filters)[0])
-    plain = isinstance(known.contraction, Diagonal) and known.reader is None
-    if x is None or not plain or vectors.size > _ON_HOST or m * k * k > _ON_HOST:
+    plain = isinstance(contraction, Diagonal) and reader is None
+    if not plain or vectors.size > _ON_HOST or m * k * k > _ON_HOST:
         return None
-    weights, of_f, of_lambda_f, matters = map(np.asarray, mixing(filters, known.pairs[0], known.pairs[2], known.fixed))
-    change = x.change
+    functions, included = np.asarray(vectors), np.asarray(kept)
+    weights, of_f, of_lambda_f, matters = map(np.asarray, mixing(filters, values, kept, fixed))
     # For each filter, the matrix entry (i, j) is negligible unless i < n or j < n. The matrices are symmetric, so a sum
     # over i < n and all j is enough, if its terms with j ≥ n count twice.
     last = [int(np.max(np.flatnonzero(one), initial=-1)) + 1 for one in matters]
     times = [np.where(np.arange(k) < n, 1, 2) for n in last]
-    if y is None:
-        images = ((matrix.to_scipy() @ vectors.T).T for matrix in (change.stiffness, change.mass))
-        stiffness, mass = (each @ vectors.T for each in images)
-        d_frame = np.where(kept[:, None], np.asarray(x.d_frame), 0)
-        result = weights @ (2 * vectors * d_frame)
+
+    def apply(changes: tuple[Array, Pencil]) -> np.ndarray:
+        d_frame, change = np.where(included[:, None], np.asarray(changes[0]), 0), changes[1]
+        images = ((matrix.to_scipy() @ functions.T).T for matrix in (change.stiffness, change.mass))
+        stiffness, mass = (each @ functions.T for each in images)
+        result = weights @ (2 * functions * d_frame)
         for one, (n, count) in enumerate(zip(last, times, strict=True)):
             matrix = (of_f[one] * stiffness - of_lambda_f[one] * mass)[:n] * count
-            result[one] += np.sum(vectors[:n] * (matrix @ vectors), axis=0)
+            result[one] += np.sum(functions[:n] * (matrix @ functions), axis=0)
         return result
-    # From the cotangent of the diagonal, the transposed derivative computes the cotangents of its arguments.
-    stiffness, mass = np.zeros((k, k), vectors.dtype), np.zeros((k, k), vectors.dtype)
-    for one, (n, count) in enumerate(zip(last, times, strict=True)):
-        outer = (vectors[:n] * y[0][one]) @ vectors.T * count
-        stiffness[:n] += of_f[one, :n] * outer
-        mass[:n] -= of_lambda_f[one, :n] * outer
-    d_frame = np.where(kept[:, None], 2 * vectors * (weights.T @ y[0]), 0)
-    return {"d_frame": d_frame, "change": change_of(change, vectors, stiffness @ vectors, mass @ vectors)}
+
+    def transpose(like: tuple[Any, Pencil], y: np.ndarray) -> tuple[np.ndarray, SymmetricPencil]:
+        stiffness, mass = np.zeros((k, k), functions.dtype), np.zeros((k, k), functions.dtype)
+        for one, (n, count) in enumerate(zip(last, times, strict=True)):
+            outer = (functions[:n] * y[one]) @ functions.T * count
+            stiffness[:n] += of_f[one, :n] * outer
+            mass[:n] -= of_lambda_f[one, :n] * outer
+        d_frame = np.where(included[:, None], 2 * functions * (weights.T @ y), 0)
+        return d_frame, change_of(like[1], functions, stiffness @ functions, mass @ functions)
+
+    return HostMap(apply, transpose)

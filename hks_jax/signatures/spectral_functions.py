@@ -3,12 +3,10 @@
 import operator
 from collections.abc import Callable
 from functools import partial, reduce
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.arrays import StaticArray, nan_outside
@@ -19,9 +17,10 @@ from hks_jax.eigen.rotations import changes_between
 from hks_jax.fem.nodal import on_all_nodes
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import FunctionSpace
-from hks_jax.linear.linear_map import first_order_only
+from hks_jax.linear.linear_map import first_order_only, instantiated, is_constant
+from hks_jax.linear.linear_program import linear_program
 from hks_jax.linear.products import row_blocks
-from hks_jax.signatures.contractions import Applied, Columns, Contraction, Diagonal, SquaredDistances, by_numpy, shapes
+from hks_jax.signatures.contractions import Applied, Columns, Contraction, Diagonal, SquaredDistances, by_numpy
 from hks_jax.signatures.filters import Custom, Derivative, Filter, mixing, weights_of
 
 _FILTERS = 8
@@ -125,43 +124,46 @@ def _weighted(contraction: Contraction, weights: Float[Array, "m k"], vectors: F
 def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     (contraction, filters, pairs), (d_contraction, d_filters, d_pairs) = primals, tangents
     value, terms = _kernel(contraction, filters, pairs), []
-    if isinstance(contraction, Applied) and not _is_constant(d_contraction.functionals):
+    if isinstance(contraction, Applied) and not is_constant(d_contraction.functionals):
         terms.append(_kernel(d_contraction, filters, pairs))  # linear in the functionals
-    if not _is_constant(d_filters):
-        terms.append(_kernel(contraction, Derivative(filters, _instantiated(d_filters)), pairs))
-    if not _is_constant(d_pairs.pencil):
+    if not is_constant(d_filters):
+        terms.append(_kernel(contraction, Derivative(filters, instantiated(d_filters)), pairs))
+    if not is_constant(d_pairs.pencil):
         pairs = first_order_only(pairs)
-        change, d_frame = _instantiated((d_pairs.pencil, d_pairs.frame))
-        known, pencil = (pairs.eigenvalues, pairs.frame, pairs.kept), pairs.pencil
+        pencil, moved = pairs.pencil, instantiated((d_pairs.frame, d_pairs.pencil))
         reader = None if pencil.row_sums is None else pencil
-        terms.append(_tangent(contraction, filters, known, d_frame, pencil.n_fixed > 0, change, reader))
-    elif not _is_constant((d_pairs.eigenvalues, d_pairs.frame)):  # the arrays themselves change, so JAX's rules apply
+        known = contraction, filters, pairs.eigenvalues, pairs.frame, pairs.kept, reader
+        terms.append(linear_program(_tangent, (pencil.n_fixed > 0,), known, moved, value, by_numpy))
+    elif not is_constant((d_pairs.eigenvalues, d_pairs.frame)):  # the arrays themselves change, so JAX's rules apply
         pairs = first_order_only(pairs)
         moved = jax.jvp(
             lambda values, vectors: _weighted(
                 contraction, _all_weights(filters, values, pairs.kept), pairs.pencil.read(vectors)
             ),
             (pairs.eigenvalues, pairs.frame),
-            _instantiated((d_pairs.eigenvalues, d_pairs.frame)),
+            instantiated((d_pairs.eigenvalues, d_pairs.frame)),
         )
         terms.append(moved[1])
     return value, reduce(operator.add, terms) if terms else jnp.zeros_like(value)
 
 
 # The transposed derivative recomputes intermediate results, which would take twice the memory of the eigenvectors.
-@jit_quickly(static_argnames="fixed", linear=("d_frame", "change"), shapes=shapes, numpy_rule=by_numpy)
-@partial(jax.checkpoint, static_argnums=4)
+@partial(jax.checkpoint, static_argnums=0)
 def _tangent(
+    fixed: bool,
     contraction: Contraction,
     filters: Filter,
-    pairs: tuple[Float[Array, " k"], Float[Array, "k n_dof"], Bool[Array, " k"]],
-    d_frame: Float[Array, "k n_dof"],
-    fixed: bool,
-    change: Pencil,
+    values: Float[Array, " k"],
+    vectors: Float[Array, "k n_dof"],
+    kept: Bool[Array, " k"],
     reader: Pencil | None,
+    changes: tuple[Float[Array, "k n_dof"], Pencil],
 ) -> Array:
-    """Return the derivative of the contraction for the change of the pencil, given its pairs and their xᵢ (d_frame)."""
-    values, vectors, kept = pairs
+    """Return the derivative of the contraction for the change of the pencil, given its pairs.
+
+    ``changes`` are the xᵢ of the pairs (d_frame), and the change of the pencil.
+    """
+    d_frame, change = changes
     d_frame = jnp.where(kept[:, None], d_frame, 0)  # d_frame may be NaN where pairs are not kept
     stiffness, mass = changes_between(vectors, change)
     weights = _all_weights(filters, values, kept)
@@ -193,21 +195,6 @@ def _each(filters: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"]) 
 
 
 _each_at_once = jit_quickly()(_each)
-
-
-def _is_zero(leaf: Any) -> bool:
-    return isinstance(leaf, SymbolicZero)
-
-
-def _is_constant(tangents: Any) -> bool:
-    return all(_is_zero(leaf) for leaf in jax.tree.leaves(tangents, is_leaf=_is_zero))
-
-
-def _instantiated(tree: Any) -> Any:
-    def instantiate(leaf: Any) -> Array:
-        return jnp.zeros(leaf.shape, leaf.dtype) if _is_zero(leaf) else leaf
-
-    return jax.tree.map(instantiate, tree, is_leaf=_is_zero)
 
 
 def source_indices(pairs: Eigenpairs, sources: object) -> Int[np.ndarray, " s"]:
