@@ -157,13 +157,11 @@ def solve_doubled(
 
     For traced values, each problem is solved for the largest number of pairs that it can have among the k lowest
     (`_limits`). For concrete values, each problem is first solved for an equal share of the k pairs plus a margin, and
-    again for twice as many pairs while some of its pairs may be missing. The margin is about 2√k, because by Weyl's law
-    boundary conditions change the number of a problem's pairs among the k lowest by about √k.
+    again for twice as many pairs while some of its pairs may be missing.
     """
     parts, limits = pencil.parts, _limits(pencil, k)
     traced = is_traced(jax.lax.stop_gradient(pencil))
-    share = math.ceil(k / len(parts)) + 2 * math.isqrt(k) + 4
-    wanted = limits if traced else [min(limit, share) for limit in limits]
+    wanted = limits if traced else [min(limit, _share(pencil, k)) for limit in limits]
     solvers = choose_solvers(solver, pencil, k)
 
     def solve(number: int, report: Report) -> PencilEigenpairs:
@@ -191,6 +189,20 @@ def _limits(pencil: MirrorPencil, k: int) -> list[int]:
     """Return, for each problem, the largest possible number of its pairs among the k lowest pairs of all problems."""
     shares = zip(pencil.including, pencil.parts, strict=True)
     return [min(max(k // len(including), 1), part.size) for including, part in shares]
+
+
+# By Weyl's law, a problem has N(λ) ≈ V λ^(3/2)/6π² ± S λ/16π eigenvalues below λ in 3D, and (A λ ± L √λ)/4π in 2D, where
+# S or L is the measure of its boundary. The boundary terms of all problems cancel: with the share m = k/n of each of n
+# problems, the k-th eigenvalue of all is about (6π²m/V)^(2/3) or 4πm/A. There the boundary term of the even problem is
+# S V^(−2/3) (6π²m)^(2/3)/16π or L √(m/4πA): for a cube 1.8 m^(2/3), for a square 1.1 √m. The margin is 2.5 times as
+# large, for domains with a longer boundary.
+_MARGIN = {2: 2.8, 3: 4.5}
+
+
+def _share(pencil: MirrorPencil, k: int) -> int:
+    """Return a number of pairs that each problem rarely exceeds among the k lowest pairs of all problems."""
+    d, mean = pencil.space.dimension, k / len(pencil.parts)
+    return math.ceil(mean + _MARGIN[d] * mean ** (1 - 1 / d)) + 4
 
 
 def _of_problem(report: Report, number: int, of: int) -> Report:

@@ -195,10 +195,12 @@ class Eigenpairs(ABC):
     @property
     def _spectrum(self) -> Spectrum:
         # A known null space makes the lowest eigenvalues exact, and the distance of the others from zero is accurate.
-        unknown = [indistinct(pencil, self.eigenvalues.dtype) for pencil in self._pencils if pencil.null_space is None]
-        rounding = jnp.max(jnp.stack(unknown)) if unknown else jnp.zeros((), self.eigenvalues.dtype)
-        known = self.eigenvalues, self.next_eigenvalue, self.spectral_origin, self.multiplet_tolerance, rounding
-        return Spectrum(*jax.lax.stop_gradient(known))
+        pairs = jax.lax.stop_gradient(self)
+        values, unknown = pairs.eigenvalues, [pencil for pencil in pairs._pencils if pencil.null_space is None]
+        rounding = jnp.zeros((), values.dtype)
+        if unknown:
+            rounding = jnp.max(jnp.stack([indistinct(pencil, values.dtype) for pencil in unknown]))
+        return Spectrum(values, pairs.next_eigenvalue, pairs.spectral_origin, pairs.multiplet_tolerance, rounding)
 
     @property
     def unconfirmed(self) -> Bool[Array, ""]:
@@ -369,7 +371,7 @@ def require_pairs(pairs: Eigenpairs) -> Eigenpairs:
     """Return the pairs; raise TypeError or ValueError unless they are eigenpairs of one domain."""
     if not isinstance(pairs, Eigenpairs):
         raise TypeError(f"pairs: got {type(pairs).__name__}; expected the result of `eigenpairs`")
-    if pairs.eigenvalues.ndim != 1:
+    if pairs.problems[0].eigenvalues.ndim != 1:
         raise ValueError(
             f"pairs: got a batch with eigenvalues of shape {pairs.eigenvalues.shape}; expected (k,). Use jax.vmap, or "
             "jax.tree.map(lambda x: x[i], pairs) for one of them"

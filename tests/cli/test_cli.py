@@ -568,7 +568,8 @@ def test_a_failed_computation_is_code_1(npz, tmp_path, capsys, monkeypatch):
 
     def unconverged(*args, **kwargs):
         pairs = compute(*args, **kwargs)
-        return eqx.tree_at(lambda p: p.converged, pairs, np.zeros(pairs.k, bool))
+        none = (eqx.tree_at(lambda p: p.converged, each, np.zeros(each.k, bool)) for each in pairs.problems)
+        return pairs.with_problems(none)
 
     monkeypatch.setattr(hj, "eigenpairs", unconverged)
     code = main(["hks", str(npz), "-o", str(tmp_path / "out"), "-k", "10"])
