@@ -191,8 +191,8 @@ def _limits(pencil: MirrorPencil, k: int) -> list[int]:
     return [min(max(k // len(including), 1), part.size) for including, part in shares]
 
 
-# By Weyl's law, a problem has N(λ) ≈ V λ^(3/2)/6π² ± S λ/16π eigenvalues below λ in 3D, and (A λ ± L √λ)/4π in 2D, where
-# S or L is the measure of its boundary. The boundary terms of all problems cancel: with the share m = k/n of each of n
+# By Weyl's law, a problem has N(λ) ≈ V λ^(3/2)/6π² ± S λ/16π eigenvalues below λ in 3D, and (A λ ± L √λ)/4π in 2D; S
+# or L is the measure of its boundary. The boundary terms of all problems cancel: with the share m = k/n of each of n
 # problems, the k-th eigenvalue of all is about (6π²m/V)^(2/3) or 4πm/A. There the boundary term of the even problem is
 # S V^(−2/3) (6π²m)^(2/3)/16π or L √(m/4πA): for a cube 1.8 m^(2/3), for a square 1.1 √m. The margin is 2.5 times as
 # large, for domains with a longer boundary.
