@@ -8,6 +8,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.sharding import Mesh, NamedSharding
 from jaxtyping import Array, Bool, Float
 
@@ -21,7 +22,7 @@ from hks_jax.eigen.filter.subspace_iteration import FilterPlan, FilterState, Gri
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, Status, silent
 from hks_jax.fem.halo import checked_mesh
-from hks_jax.fem.nodal import NodalPencil, nodal_pencil
+from hks_jax.fem.nodal import NodalPencil, cropped, nodal_pencil
 from hks_jax.fem.pencil import Pencil, from_lower_bound
 from hks_jax.fem.space import GridSpace
 from hks_jax.fem.stencil import StencilOperator
@@ -93,6 +94,7 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         """Return the k lowest eigenpairs; the bound is NaN, because the method has no certificate."""
         moved, origin = from_lower_bound(pencil)
         assert isinstance(moved, Pencil)
+        moved = cropped(moved)
         assert isinstance(moved.space, GridSpace)
         plan = self.plan(k, moved.space)
         compute = _compiled if is_traced(moved) else _lowest
@@ -152,7 +154,11 @@ def _converge(grid: GridFilter, rounding: Array, state: FilterState, max_rounds:
     pace = Pace(float(jnp.max(excess(state))))
     in_steps = grid.plan.mesh is None and state.vectors.size >= _LARGE
     while going_on(state):
-        text = f"{int(jnp.sum(excess(state) <= 1))} of {wanted} pairs, round {int(state.rounds) + 1}"
+        beyond = np.asarray(excess(state))
+        text = (
+            f"round {int(state.rounds) + 1}: {int((beyond <= 1).sum())} of {wanted} pairs, residuals up to "
+            f"{float(beyond.max()) * grid.plan.tolerance:.0e} (wanted {grid.plan.tolerance:.0e})"
+        )
         report(Status(text, pace.seconds_left()))
 
         def tell(done: int, of: int, text: str = text) -> None:
