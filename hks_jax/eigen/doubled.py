@@ -48,7 +48,7 @@ class DoubledEigenpairs(Eigenpairs, eqx.Module):
     rounding = _merged("rounding")
     kept = _merged("kept")
 
-    def merged(self, values: Sequence[Array | np.ndarray]) -> Array:
+    def merged(self, values: Sequence[Any]) -> Array:
         """Return the values (…, k) for each pair, given those for the pairs of each problem."""
         return _in_order(list(values), self._spectra, self.including, self.k, -1)
 

@@ -113,7 +113,7 @@ class Eigenpairs(ABC):
         """Keep only the marked pairs, the lowest ones; signatures then ignore the other pairs."""
 
     @abstractmethod
-    def merged(self, values: Sequence[Array | np.ndarray]) -> Array:
+    def merged(self, values: Sequence[Any]) -> Array:
         """Return the values (…, k) for each pair, given those for the pairs of each problem."""
 
     def of_even(self, values: Float[Array, "*leading k0"] | Bool[Array, " k0"]) -> Array:
@@ -350,7 +350,7 @@ class PencilEigenpairs(Eigenpairs, eqx.Module):
         following = _first_beyond(kept, *jax.lax.stop_gradient((self.eigenvalues, self.next_eigenvalue)))
         return eqx.tree_at(lambda p: (p.kept, p.next_eigenvalue), self, (kept, following))
 
-    def merged(self, values: Sequence[Array | np.ndarray]) -> Array:
+    def merged(self, values: Sequence[Any]) -> Array:
         """Return the values of the only problem."""
         return values[0]
 
