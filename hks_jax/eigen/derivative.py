@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
 from typing import Any, Literal
 
 import equinox as eqx
@@ -12,7 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.compilation import jit_quickly, numpy_where_known
+from hks_jax.compilation import numpy_where_known
 from hks_jax.eigen.adjoints.complement import Adjoint, OfRows, Rows, Scalar, Values, Vectors, unsolved
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.rotations import gaps
@@ -20,6 +19,7 @@ from hks_jax.eigen.solver import Eigensolver, RawPairs, Report
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear import lapack
 from hks_jax.linear.linear_map import first_order_only, with_transpose
+from hks_jax.linear.linear_program import HostMap, linear_program
 from hks_jax.linear.loops import one_by_one
 from hks_jax.linear.products import inner_products, matmul
 from hks_jax.linear.symmetric_pencil import SymmetricPencil
@@ -78,7 +78,9 @@ def _solved_jvp(
     # Metric and density are removed: derivatives do not need them, and reverse mode would store their arrays.
     pencil = replace(pencil, metric=None, density=None)
     on_failure: OnFailure = "error" if throw else "nothing" if is_traced(primals) else "warning"
-    tangents = tangents_of(adjoint, on_failure, prepared, pencil, origin, change, values, vectors, functions)
+    known = prepared, pencil, origin, values, vectors, functions
+    settings, shapes = (adjoint, on_failure), (eigenvalues, functions)
+    tangents = linear_program(_tangents, settings, known, change, shapes, _by_numpy)
     constants = following if extra else jnp.full_like(following, jnp.inf), complete_below
     return (eigenvalues, functions, *constants), (*tangents, *map(jnp.zeros_like, constants))
 
@@ -107,42 +109,48 @@ def _solves(pencil: SymmetricPencil, k: int, p: int) -> bool:
     return p < pencil.size and pencil.n_fixed < k
 
 
-def _shapes(*args: Any) -> tuple[Any, Any]:
-    functions = args[-1]
-    return jax.ShapeDtypeStruct((len(functions),), functions.dtype), functions
-
-
-def _numpy_rule(known: SimpleNamespace, x: SimpleNamespace | None, y: list[Any] | None) -> Any:
-    """Compute `tangents_of` by NumPy; if cotangents y of its result are given, compute the cotangent of ``change``."""
-    pencil, pairs = known.pencil, (known.values, known.vectors)
-    values, vectors, functions = map(np.asarray, (*pairs, known.functions))
-    if vectors.size > _ON_HOST or x is None:
+def _by_numpy(
+    adjoint: Adjoint,
+    on_failure: OnFailure,
+    prepared: Any,
+    pencil: SymmetricPencil,
+    origin: Scalar,
+    values: Values,
+    vectors: Vectors,
+    functions: Rows,
+) -> HostMap | None:
+    """Return `_tangents` by NumPy."""
+    if vectors.size > _ON_HOST:
         return None
-    change, k = x.change, len(functions)
-    eigenvalues, guards = (values[:k] + np.asarray(known.origin))[:, None], vectors[k:]
-    _, inverse = gaps(np, values, k, np.asarray(indistinct(pencil, values.dtype)))
+    k, rows = len(functions), np.asarray(functions)
+    guards = np.asarray(vectors)[k:]
+    eigenvalues = (np.asarray(values)[:k] + np.asarray(origin))[:, None]
+    _, inverse = gaps(np, np.asarray(values), k, np.asarray(indistinct(pencil, values.dtype)))
 
     def outside(rhs: np.ndarray) -> np.ndarray:
         if not _solves(pencil, k, len(values)):
             return np.zeros_like(rhs)
         free = np.arange(k)[:, None] >= pencil.n_fixed
         free_rhs = jax.device_put(np.where(free, rhs, 0))
-        solution = np.asarray(known.adjoint.solve(known.prepared, pencil, *pairs, free_rhs))
+        solution = np.asarray(adjoint.solve(prepared, pencil, values, vectors, free_rhs))
         if np.isnan(solution).any():
-            _checked(known.on_failure, jax.device_put(solution))
+            _checked(on_failure, jax.device_put(solution))
         return np.where(free, solution, 0)
 
     def onto(force: np.ndarray) -> np.ndarray:
         return (inverse[:, k:] * (force @ guards.T)) @ guards - outside(force)
 
-    if y is None:
-        moved = (change.mass.to_scipy() @ functions.T).T
-        force = (change.stiffness.to_scipy() @ functions.T).T - eigenvalues * moved
-        return np.sum(functions * force, axis=1), onto(force)
-    # Reverse mode is the transpose of the computation above.
-    of_values, of_frame = y
-    force = of_values[:, None] * functions + onto(of_frame)
-    return {"change": change_of(change, functions, force, -eigenvalues * force)}
+    def apply(change: SymmetricPencil) -> tuple[np.ndarray, np.ndarray]:
+        moved = (change.mass.to_scipy() @ rows.T).T
+        force = (change.stiffness.to_scipy() @ rows.T).T - eigenvalues * moved
+        return np.sum(rows * force, axis=1), onto(force)
+
+    def transpose(like: SymmetricPencil, y: tuple[np.ndarray, np.ndarray]) -> SymmetricPencil:
+        of_values, of_frame = y
+        force = of_values[:, None] * rows + onto(of_frame)
+        return change_of(like, rows, force, -eigenvalues * force)
+
+    return HostMap(apply, transpose)
 
 
 def change_of(change: SymmetricPencil, x: Rows, *p: Rows) -> SymmetricPencil:
@@ -153,18 +161,17 @@ def change_of(change: SymmetricPencil, x: Rows, *p: Rows) -> SymmetricPencil:
 
 
 # Without the checkpoint, reverse mode would store copies of the eigenvectors.
-@jit_quickly(static_argnames=("adjoint", "on_failure"), linear=("change",), shapes=_shapes, numpy_rule=_numpy_rule)
 @partial(jax.checkpoint, static_argnums=(0, 1))
-def tangents_of(
+def _tangents(
     adjoint: Adjoint,
     on_failure: OnFailure,
     prepared: Any,
     pencil: SymmetricPencil,
     origin: Scalar,
-    change: SymmetricPencil,
     values: Values,
     vectors: Vectors,
     functions: Rows,
+    change: SymmetricPencil,
 ) -> tuple[OfRows, Rows]:
     """Return the tangents of the first k of p computed eigenvalues, and of the frame of `solved`.
 
@@ -221,7 +228,7 @@ def _checked(on_failure: OnFailure, x: Rows) -> Rows:
     return x
 
 
-@numpy_where_known(jit_quickly())
+@numpy_where_known()
 def _with_null_modes(xp: Any, mass: Any, nulls: Any, values: Any, vectors: Any) -> tuple[Any, Any]:
     """Replace the solver's approximations of null vectors by the pencil's null vectors.
 

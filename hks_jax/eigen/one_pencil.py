@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hks_jax.arrays import jax_array
-from hks_jax.compilation import is_concrete_on_cpu, jit_quickly, numpy_where_known
+from hks_jax.compilation import is_concrete_on_cpu, numpy_where_known
 from hks_jax.eigen.derivative import solved
 from hks_jax.eigen.eigenpairs import UNCERTAIN, Eigenpairs
 from hks_jax.eigen.quality import allowed_residuals, indistinct, largest, largest_of, measure_pairs, measured_on_host
@@ -89,7 +89,7 @@ def _pairs(pencil: Pencil, found: tuple[Any, ...], solver: Eigensolver) -> Eigen
     )
 
 
-@numpy_where_known(jit_quickly())
+@numpy_where_known()
 def _with_small(xp: Any, values: Any, constant: Any, zero: Any, small: Any) -> Any:
     """Replace eigenvalues near zero by ``small``; they keep their derivatives."""
     return xp.where(zero, small + (values - constant), values)
@@ -120,7 +120,7 @@ def _near_zero(
     return jax.device_put((small, rounding))
 
 
-@numpy_where_known(jit_quickly(static_argnames=("n_null", "tolerance", "known", "stored")), most=3 << 18)
+@numpy_where_known(most=3 << 18, static_argnames=("n_null", "tolerance", "known", "stored"))
 def _quality(
     xp: Any,
     pencil: Any,

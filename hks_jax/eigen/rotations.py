@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hks_jax.compilation import jit_quickly, numpy_where_known
+from hks_jax.compilation import numpy_where_known
 from hks_jax.eigen.adjoints.complement import OfRows, Rows, Scalar, Values
 from hks_jax.eigen.quality import indistinct
 from hks_jax.fem.pencil import AnyPencil, Pencil
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.linear_map import first_order_only, with_transpose
+from hks_jax.linear.linear_program import linear_program
 from hks_jax.linear.products import even_size, inner_products, matmul, row_blocks
 
 _ROWS = 128
@@ -50,18 +51,14 @@ def _with_rotations_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     for number, (each, moved) in enumerate(zip(pencil.parts, change.parts, strict=True)):
         own = among if part is None else among & (part == number)[:, None] & (part == number)[None]
         rounding = indistinct(each, values.dtype)
-        tangent = tangent + _rotations(frame, values, own, rounding, pencil.space, len(pencil.parts), moved)
+        known = frame, values, own, rounding, pencil.space
+        tangent = tangent + linear_program(_rotations, (len(pencil.parts),), known, moved, frame)
     return frame, tangent
 
 
-def _shape(frame: Rows, *args: Any) -> Any:
-    return jax.ShapeDtypeStruct(frame.shape, frame.dtype)
-
-
-@jit_quickly(static_argnames="copies", linear=("change",), shapes=_shape)
-@partial(jax.checkpoint, static_argnums=5)
+@partial(jax.checkpoint, static_argnums=0)
 def _rotations(
-    frame: Rows, values: Values, among: Among, rounding: Scalar, space: FunctionSpace, copies: int, change: Pencil
+    copies: int, frame: Rows, values: Values, among: Among, rounding: Scalar, space: FunctionSpace, change: Pencil
 ) -> Rows:
     stiffness, mass = changes_between(frame, space, copies, change)
     apart, inverse = gaps(jnp, values, len(values), rounding)

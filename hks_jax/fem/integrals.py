@@ -3,7 +3,6 @@
 from dataclasses import replace
 from functools import partial
 from itertools import product
-from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -16,18 +15,18 @@ from hks_jax.compilation import jit_quickly, numpy_where_known
 from hks_jax.domain import spd
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.simplicial_mesh import SimplicialMesh, oriented
-from hks_jax.domain.tensor_checks import Interpolation
 from hks_jax.domain.tensor_field import TensorField, diffusion_tensors
 from hks_jax.fem.elements import MASS, Element, element_matrices, moved, simplex_element, tensor_product_element
 from hks_jax.fem.fields import Field
 from hks_jax.fem.forms import WeakForm
+from hks_jax.fem.host_integrals import Geometry, Integrals, Settings, host_integrals
 from hks_jax.fem.pencil import Pencil, assembled, gathered, row_sums_of
 from hks_jax.fem.resolution import SampledMetric
-from hks_jax.fem.space import GridSpace, MeshSpace, cells_of, couplings_for, mask_for, vector_space
+from hks_jax.fem.space import GridSpace, MeshSpace, couplings_for, mask_for, vector_space
 from hks_jax.fem.stencil import StencilOperator
-
-_ON_HOST = 1 << 17
-"""NumPy integrates up to this number of tensor entries, which takes milliseconds and no compilation."""
+from hks_jax.linear.linear_map import instantiated
+from hks_jax.linear.linear_program import HostMap, linear_program
+from hks_jax.traced import is_traced
 
 
 def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace, operator: WeakForm) -> Pencil:
@@ -39,10 +38,10 @@ def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace
     table = element.gradients / spacing, element.weights * spacing.prod(), spacing
     gradients, weights, steps = (np.asarray(x, tensors.dtype) for x in table)
     domain, elements = (mask_for(tensors, mask) for mask in (space.domain, space.elements))
-    couplings, settings = couplings_for(tensors, space), (space.periodic, field.interpolation, operator)
     x = grid_points(field.grid, space, tensors.dtype) if operator.own else None
-    arrays = tensors, domain, elements, couplings, gradients, weights, steps
-    *matrices, lumped, volume = _grid_integrals(*arrays, x, fields, *settings)
+    geometry = Geometry(domain, elements, couplings_for(tensors, space), gradients, weights, steps, x)
+    settings = Settings(space.periodic, field.interpolation, operator)
+    *matrices, lumped, volume = _grid_integrals(settings, geometry, tensors, fields)
     metric = SampledMetric(jax.lax.stop_gradient(field.tensors), steps, field.interpolation, operator.fick)
     density = _root(tensors, domain) if operator.fick else None
     if operator.components > 1:
@@ -85,86 +84,39 @@ def _points_from(
     return origin + spacing * (low[..., None, :] + inner)
 
 
-def _numpy_rule(known: SimpleNamespace, x: SimpleNamespace | None, y: list[Any] | None) -> Any:
-    """Compute the integrals without fields, their tangents, or the cotangents of the tensors, with NumPy."""
-    tensors, domain, periodic, operator = known.tensors, known.domain, known.periodic, known.operator
-    plain = operator == WeakForm(lumped=operator.lumped, fick=operator.fick) and not known.fields
-    if (
-        not plain
-        or known.interpolation != "linear"
-        or tensors.size > _ON_HOST
-        or (x is not None and len(jax.tree.leaves(vars(x))) > 1)
-    ):
-        return None
-    gradients, weights = known.gradients, known.weights
-    d, n, dtype, shape = len(periodic), 2 ** len(periodic), tensors.dtype, domain.shape
-    h, nodes = tensor_product_element(d).values.astype(dtype), np.asarray(tensors).reshape(-1, d, d)
-    corners = np.array(list(product((0, 1), repeat=d)))
-    offsets = (corners[None] - corners[:, None] + 1) @ 3 ** np.arange(d)[::-1]
-    cells = cells_of(np.asarray(known.elements), shape, periodic)
-    places = cells[:, :, None] + offsets * domain.size
-    of_stiffness = np.einsum("q,qia,qjb->qabij", weights, gradients, gradients).reshape(-1, n * n)
-    of_mass = np.einsum("q,qi,qj->qij", weights, h, h).reshape(-1, n * n)
-    coupled = np.ones((), bool) if known.couplings is None else known.couplings
-    # Nodes outside the domain have no influence, whatever their tensors are.
-    valid = np.where(domain.ravel(), np.where(spd.is_spd(nodes), 1, np.nan), 0).astype(dtype)[:, None, None]
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _grid_integrals(settings: Settings, geometry: Geometry, tensors: Array, fields: dict[str, Field]) -> Integrals:
+    """Return the integrals, computed by NumPy for small fields. Derivatives treat the geometry as constant."""
+    host = host_integrals(settings, geometry, tensors, fields)
+    return _compiled_integrals(settings, geometry, tensors, fields) if host is None else jax.device_put(host.value())
 
-    def inside(nodal: np.ndarray) -> np.ndarray:
-        at_corners = (nodal * valid)[cells].reshape(-1, n, d * d)
-        return np.matmul(h, at_corners).reshape(-1, n, d, d)
 
-    def integrals(flux: np.ndarray, density: np.ndarray, metric_density: np.ndarray) -> tuple[Any, ...]:
-        of_elements = flux.reshape(len(cells), -1) @ of_stiffness, density @ of_mass
-        sums = (np.bincount(places.ravel(), each.ravel(), 3**d * domain.size) for each in of_elements)
-        stiffness, mass = (each.astype(dtype).reshape(3**d, *shape) for each in sums)
-        couplings = np.where(coupled, stiffness, 0), np.where(coupled, mass, 0)
-        return *couplings, mass.sum(axis=0), np.sum(metric_density @ weights)
+@partial(_grid_integrals.defjvp, symbolic_zeros=True)
+def _grid_integrals_jvp(settings: Settings, primals: tuple, changes: tuple) -> tuple[Integrals, Integrals]:
+    change = instantiated(changes[1:])
+    if is_traced(primals):
+        return jax.jvp(partial(_compiled_integrals, settings, primals[0]), primals[1:], change)
+    value = _grid_integrals(settings, *primals)
+    return value, linear_program(_change_of_integrals, (settings,), primals, change, value, _host_derivative)
 
-    # The integrands of a metric T have d(√|T| T⁻¹) = √|T| (½ tr(T⁻¹dT) T⁻¹ − T⁻¹dT T⁻¹) and d√|T| = ½√|T| tr(T⁻¹dT).
-    # The integrands of Fick's operator, whose tensors are D, are D and 1, and |D|^(−½) for the volume of the metric.
-    given, fick = inside(nodes), operator.fick
-    root, inverse = np.sqrt(spd.determinant(given)), spd.inverse(given)
-    flux, across = given if fick else root[..., None, None] * inverse, np.swapaxes(inverse, -1, -2)
-    if x is None:
-        return integrals(flux, np.ones_like(root) if fick else root, 1 / root if fick else root)
-    if y is None:
-        change = inside(np.asarray(x.tensors).reshape(-1, d, d))
-        half = np.sum(across * change, axis=(-2, -1)) / 2
-        if fick:
-            return integrals(change, np.zeros_like(root), -half / root)
-        return integrals(half[..., None, None] * flux - flux @ change @ inverse, root * half, root * half)
-    stiffness, mass = np.where(coupled, y[0], 0), np.where(coupled, y[1], 0) + y[2]
-    of_flux, of_root = (
-        each.ravel()[places].reshape(-1, n * n) @ table.T
-        for each, table in ((stiffness, of_stiffness), (mass, of_mass))
+
+def _change_of_integrals(settings: Settings, geometry: Geometry, tensors: Array, fields: Any, change: Any) -> Integrals:
+    return jax.jvp(partial(_compiled_integrals, settings, geometry), (tensors, fields), change)[1]
+
+
+def _host_derivative(settings: Settings, geometry: Geometry, tensors: Array, fields: Any) -> HostMap | None:
+    host = host_integrals(settings, geometry, tensors, fields)
+    return None if host is None else host.derivative
+
+
+@jit_quickly(static_argnums=0)
+def _compiled_integrals(
+    settings: Settings, geometry: Geometry, tensors: Float[Array, "*shape d d"], fields: dict[str, Field]
+) -> Integrals:
+    (periodic, interpolation, operator), (domain, elements, couplings, gradients, weights, spacing, x) = (
+        settings,
+        geometry,
     )
-    of_flux, of_volume = of_flux.reshape(given.shape), y[3] * weights
-    if fick:
-        of_tensors = of_flux - (of_volume / (2 * root))[..., None, None] * across
-    else:
-        half = (np.sum(flux * of_flux, axis=(-2, -1)) + root * (of_root + of_volume)) / 2
-        of_tensors = half[..., None, None] * across - root[..., None, None] * across @ of_flux @ across
-    of_corners = np.matmul(h.T, of_tensors.reshape(-1, n, d * d)).reshape(-1, d * d)
-    sums = [np.bincount(cells.ravel(), each, domain.size) for each in of_corners.T]
-    return {"tensors": (np.stack(sums, axis=-1).reshape(-1, d, d) * valid).astype(dtype).reshape(tensors.shape)}
-
-
-@jit_quickly(static_argnames=("periodic", "interpolation", "operator"), numpy_rule=_numpy_rule)
-def _grid_integrals(
-    tensors: Float[Array, "*shape d d"],
-    domain: Bool[np.ndarray | Array, "*shape"],
-    elements: Bool[np.ndarray | Array, "*elements"],
-    couplings: Bool[np.ndarray | Array, "offsets *shape"] | None,
-    gradients: Float[np.ndarray | Array, "q n d"],
-    weights: Float[np.ndarray | Array, " q"],
-    spacing: Float[np.ndarray | Array, " d"],
-    x: Float[Array, "*elements q d"] | None,
-    fields: dict[str, Field],
-    periodic: tuple[bool, ...],
-    interpolation: Interpolation,
-    operator: WeakForm,
-) -> tuple[Array, Array, Array, Array]:
-    """Return stiffness and mass as stencils (as element matrices for vectors), the mass's row sums and the volume."""
     element = Element(tensor_product_element(len(periodic)).values, gradients, weights)
     tensors = spd.positive_or_nan(spd.identity_outside(tensors, domain))
 

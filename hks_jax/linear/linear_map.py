@@ -9,6 +9,8 @@ from typing import Any, NoReturn, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
 
 LinearMap = Callable[[Any, Any, Any], Any]
 """f(at, constants, x), linear in x; all arguments are pytrees of arrays."""
@@ -94,6 +96,24 @@ def _backward_jvp(function: LinearMap, derivative: Derivative, primals: tuple, t
     (of_function,) = jax.linear_transpose(partial(function, at, constants), like)(d_y)
     tangent = jax.tree.map(jnp.add, of_derivative, of_function)
     return _backward(function, derivative, at, constants, like, y), tangent
+
+
+def is_constant(changes: Any) -> bool:
+    """Return whether all leaves of a rule's tangents are symbolic zeros."""
+    return all(_is_zero(leaf) for leaf in jax.tree.leaves(changes, is_leaf=_is_zero))
+
+
+def instantiated(changes: Any) -> Any:
+    """Return a rule's tangents with arrays in place of symbolic zeros."""
+
+    def full(leaf: Any) -> Any:
+        return np.zeros(leaf.shape, leaf.dtype) if _is_zero(leaf) else leaf
+
+    return jax.tree.map(full, changes, is_leaf=_is_zero)
+
+
+def _is_zero(leaf: Any) -> bool:
+    return isinstance(leaf, SymbolicZero)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))

@@ -3,7 +3,6 @@
 from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
-from types import SimpleNamespace
 from typing import Any
 
 import equinox as eqx
@@ -14,8 +13,11 @@ from jaxtyping import Array, Bool, Float
 
 from hks_jax.arrays import StaticArray
 from hks_jax.eigen.derivative import change_of
+from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import FunctionSpace
+from hks_jax.linear.linear_program import HostMap
 from hks_jax.linear.products import quadratic_forms
+from hks_jax.linear.symmetric_pencil import SymmetricPencil
 from hks_jax.signatures.filters import Filter, mixing
 
 _matmul = partial(jnp.matmul, precision="highest")
@@ -119,54 +121,60 @@ class SquaredDistances(_FromSources):
         return jnp.moveaxis(readings, 0, 1)
 
 
-def shapes(contraction: Contraction, filters: Filter, pairs: tuple[Array, Array, Array], *args: Any) -> Any:
-    """Return the shape and dtype of the derivative."""
-    vectors, m = pairs[1], len(jax.tree.leaves(filters)[0])
-    return jax.eval_shape(contraction.weighted, jax.ShapeDtypeStruct((m, len(vectors)), vectors.dtype), vectors)
-
-
-def by_numpy(known: SimpleNamespace, x: SimpleNamespace | None, y: list[Any] | None) -> Any:
-    """Compute the derivative of a kernel's diagonal, or its transpose, with NumPy; return None if JAX should."""
-    filters, selection, copies, space = known.filters, known.selection, known.copies, known.space
-    values, vectors, kept = map(np.asarray, known.pairs)
+def by_numpy(
+    fixed: bool,
+    copies: int,
+    contraction: Contraction,
+    filters: Filter,
+    values: Float[Array, " k"],
+    vectors: Float[Array, "k n_dof"],
+    kept: Bool[Array, " k"],
+    selection: tuple[Array, Array] | None,
+    space: FunctionSpace,
+    reader: Any,
+) -> HostMap | None:
+    """Return the derivative of a kernel's diagonal by NumPy; None for other kernels, and for large ones."""
     k = len(values) if selection is None else len(selection[0])
     m = len(jax.tree.leaves(filters)[0])
-    plain = isinstance(known.contraction, Diagonal) and known.reader is None and k > 0
-    if x is None or not plain or vectors.size > _ON_HOST or m * k * k > _ON_HOST:
+    plain = isinstance(contraction, Diagonal) and reader is None and k > 0
+    if not plain or vectors.size > _ON_HOST or m * k * k > _ON_HOST:
         return None
     rows: Any = slice(None)
+    own_values, functions, included = map(np.asarray, (values, vectors, kept))
     if selection is not None:
         rows, own = map(np.asarray, selection)
-        values, kept, vectors = values[rows], kept[rows], np.where(own[:, None], vectors[rows], 0)
+        own_values, included, functions = own_values[rows], included[rows], np.where(own[:, None], functions[rows], 0)
     weights, of_f, of_lambda_f, matters = map(
-        np.asarray, mixing(filters, jax.device_put(values), jax.device_put(kept), known.fixed)
+        np.asarray, mixing(filters, jax.device_put(own_values), jax.device_put(included), fixed)
     )
-    change = x.change
     # For each filter, the matrix entry (i, j) is negligible unless i < n or j < n. The matrices are symmetric, so a sum
     # over i < n and all j is enough, if its terms with j ≥ n count twice.
     last = [int(np.max(np.flatnonzero(one), initial=-1)) + 1 for one in matters]
     times = [np.where(np.arange(k) < n, 1, 2) for n in last]
 
-    def transferred(functions: np.ndarray, of: FunctionSpace, to: FunctionSpace) -> np.ndarray:
-        return np.asarray(of.transfer(jax.device_put(functions), to))
+    def transferred(rows: np.ndarray, of: FunctionSpace, to: FunctionSpace) -> np.ndarray:
+        return np.asarray(of.transfer(jax.device_put(rows), to))
 
-    moved = transferred(vectors, space, change.space)
-    if y is None:
+    def apply(changes: tuple[Array, Pencil]) -> np.ndarray:
+        d_frame, change = np.where(included[:, None], np.asarray(changes[0])[rows], 0), changes[1]
+        moved = transferred(functions, space, change.space)
         images = ((matrix.to_scipy() @ moved.T).T for matrix in (change.stiffness, change.mass))
-        stiffness, mass = (copies * transferred(each, change.space, space) @ vectors.T for each in images)
-        d_frame = np.where(kept[:, None], np.asarray(x.d_frame)[rows], 0)
-        result = weights @ (2 * vectors * d_frame)
+        stiffness, mass = (copies * transferred(each, change.space, space) @ functions.T for each in images)
+        result = weights @ (2 * functions * d_frame)
         for one, (n, count) in enumerate(zip(last, times, strict=True)):
             matrix = (of_f[one] * stiffness - of_lambda_f[one] * mass)[:n] * count
-            result[one] += np.sum(vectors[:n] * (matrix @ vectors), axis=0)
+            result[one] += np.sum(functions[:n] * (matrix @ functions), axis=0)
         return result
-    # From the cotangent of the diagonal, the transposed derivative computes the cotangents of its arguments.
-    stiffness, mass = np.zeros((k, k), vectors.dtype), np.zeros((k, k), vectors.dtype)
-    for one, (n, count) in enumerate(zip(last, times, strict=True)):
-        outer = (vectors[:n] * y[0][one]) @ vectors.T * count
-        stiffness[:n] += of_f[one, :n] * outer
-        mass[:n] -= of_lambda_f[one, :n] * outer
-    d_frame = np.zeros(x.d_frame.shape, x.d_frame.dtype)
-    d_frame[rows] = np.where(kept[:, None], 2 * vectors * (weights.T @ y[0]), 0)
-    images = (transferred(copies * each @ vectors, space, change.space) for each in (stiffness, mass))
-    return {"d_frame": d_frame, "change": change_of(change, moved, *images)}
+
+    def transpose(like: tuple[Any, Pencil], y: np.ndarray) -> tuple[np.ndarray, SymmetricPencil]:
+        stiffness, mass = np.zeros((k, k), functions.dtype), np.zeros((k, k), functions.dtype)
+        for one, (n, count) in enumerate(zip(last, times, strict=True)):
+            outer = (functions[:n] * y[one]) @ functions.T * count
+            stiffness[:n] += of_f[one, :n] * outer
+            mass[:n] -= of_lambda_f[one, :n] * outer
+        d_frame, change = np.zeros(like[0].shape, like[0].dtype), like[1]
+        d_frame[rows] = np.where(included[:, None], 2 * functions * (weights.T @ y), 0)
+        images = (transferred(copies * each @ functions, space, change.space) for each in (stiffness, mass))
+        return d_frame, change_of(change, transferred(functions, space, change.space), *images)
+
+    return HostMap(apply, transpose)

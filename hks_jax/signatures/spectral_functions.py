@@ -2,12 +2,10 @@
 
 import operator
 from functools import partial, reduce
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.arrays import StaticArray, nan_outside
@@ -18,9 +16,10 @@ from hks_jax.eigen.rotations import changes_between
 from hks_jax.fem.nodal import on_all_nodes
 from hks_jax.fem.pencil import MirrorPencil, Pencil
 from hks_jax.fem.space import FunctionSpace
-from hks_jax.linear.linear_map import first_order_only
+from hks_jax.linear.linear_map import first_order_only, instantiated, is_constant
+from hks_jax.linear.linear_program import linear_program
 from hks_jax.linear.products import row_blocks
-from hks_jax.signatures.contractions import Applied, Columns, Contraction, Diagonal, SquaredDistances, by_numpy, shapes
+from hks_jax.signatures.contractions import Applied, Columns, Contraction, Diagonal, SquaredDistances, by_numpy
 from hks_jax.signatures.filters import Custom, Derivative, Filter, mixing, weights_of
 from hks_jax.traced import is_traced
 
@@ -117,28 +116,28 @@ def _weighted(contraction: Contraction, weights: Float[Array, "m k"], vectors: F
 def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     (contraction, filters, pairs), (d_contraction, d_filters, d_pairs) = primals, tangents
     value, terms = _kernel(contraction, filters, pairs), []
-    if isinstance(contraction, Applied) and not _is_constant(d_contraction.functionals):
+    if isinstance(contraction, Applied) and not is_constant(d_contraction.functionals):
         terms.append(_kernel(d_contraction, filters, pairs))  # linear in the functionals
-    if not _is_constant(d_filters):
-        terms.append(_kernel(contraction, Derivative(filters, _instantiated(d_filters)), pairs))
-    if not _is_constant(d_pairs.pencil):
+    if not is_constant(d_filters):
+        terms.append(_kernel(contraction, Derivative(filters, instantiated(d_filters)), pairs))
+    if not is_constant(d_pairs.pencil):
         pairs = first_order_only(pairs)
-        change, d_frame = _instantiated((d_pairs.pencil, d_pairs.frame))
+        change, d_frame = instantiated((d_pairs.pencil, d_pairs.frame))
         for number, part in enumerate(pairs.pencil.parts):
             own = pairs.of_part(number)
-            known = own.eigenvalues, own.frame, own.kept
-            static = part.n_fixed > 0, len(pairs.pencil.parts), pairs.space
             reader = None if part.row_sums is None else part
-            matrices = change.parts[number], reader
-            terms.append(_tangent(contraction, filters, known, d_frame, _rows_of(own, number), *static, *matrices))
-    elif not _is_constant((d_pairs.eigenvalues, d_pairs.frame)):  # the arrays themselves change, so JAX's rules apply
+            rows = _rows_of(own, number)
+            known = contraction, filters, own.eigenvalues, own.frame, own.kept, rows, pairs.space, reader
+            settings, moved = (part.n_fixed > 0, len(pairs.pencil.parts)), (d_frame, change.parts[number])
+            terms.append(linear_program(_tangent, settings, known, moved, value, by_numpy))
+    elif not is_constant((d_pairs.eigenvalues, d_pairs.frame)):  # the arrays themselves change, so JAX's rules apply
         pairs = first_order_only(pairs)
         moved = jax.jvp(
             lambda values, vectors: _weighted(
                 contraction, _all_weights(filters, values, pairs.kept), _read(pairs, vectors)
             ),
             (pairs.eigenvalues, pairs.frame),
-            _instantiated((d_pairs.eigenvalues, d_pairs.frame)),
+            instantiated((d_pairs.eigenvalues, d_pairs.frame)),
         )
         terms.append(moved[1])
     return value, reduce(operator.add, terms) if terms else jnp.zeros_like(value)
@@ -163,22 +162,27 @@ def _rows_of(pairs: Eigenpairs, number: int) -> tuple[Int[Array, " m"], Bool[Arr
 
 
 # The transposed derivative recomputes intermediate results, which would take twice the memory of the eigenvectors.
-@jit_quickly(static_argnames=("fixed", "copies"), linear=("d_frame", "change"), shapes=shapes, numpy_rule=by_numpy)
-@partial(jax.checkpoint, static_argnums=(5, 6))
+@partial(jax.checkpoint, static_argnums=(0, 1))
 def _tangent(
-    contraction: Contraction,
-    filters: Filter,
-    pairs: tuple[Float[Array, " k"], Float[Array, "k n_dof"], Bool[Array, " k"]],
-    d_frame: Float[Array, "k n_dof"],
-    selection: tuple[Int[Array, " m"], Bool[Array, " m"]] | None,
     fixed: bool,
     copies: int,
+    contraction: Contraction,
+    filters: Filter,
+    values: Float[Array, " k"],
+    vectors: Float[Array, "k n_dof"],
+    kept: Bool[Array, " k"],
+    selection: tuple[Int[Array, " m"], Bool[Array, " m"]] | None,
     space: FunctionSpace,
-    change: Pencil,
     reader: Pencil | None,
+    changes: tuple[Float[Array, "k n_dof"], Pencil],
 ) -> Array:
-    """Return the derivative of the contraction for the change of one pencil, given its pairs and their xᵢ (d_frame)."""
-    values, vectors, kept, d_frame = (x if selection is None else x[selection[0]] for x in (*pairs, d_frame))
+    """Return the derivative of the contraction for the change of one pencil, given its pairs.
+
+    ``changes`` are the xᵢ of the pairs (d_frame), and the change of the pencil.
+    """
+    d_frame, change = changes
+    if selection is not None:
+        values, vectors, kept, d_frame = (x[selection[0]] for x in (values, vectors, kept, d_frame))
     if selection is not None:
         vectors = jnp.where(selection[1][:, None], vectors, 0)  # eigenvectors of different problems do not mix
     if not len(vectors):
@@ -218,21 +222,6 @@ def _each(filters: Filter, values: Float[Array, " k"], kept: Bool[Array, " k"]) 
 
 
 _each_at_once = jit_quickly()(_each)
-
-
-def _is_zero(leaf: Any) -> bool:
-    return isinstance(leaf, SymbolicZero)
-
-
-def _is_constant(tangents: Any) -> bool:
-    return all(_is_zero(leaf) for leaf in jax.tree.leaves(tangents, is_leaf=_is_zero))
-
-
-def _instantiated(tree: Any) -> Any:
-    def instantiate(leaf: Any) -> Array:
-        return jnp.zeros(leaf.shape, leaf.dtype) if _is_zero(leaf) else leaf
-
-    return jax.tree.map(instantiate, tree, is_leaf=_is_zero)
 
 
 def source_indices(pairs: Eigenpairs, sources: object) -> Int[np.ndarray, " s"]:
