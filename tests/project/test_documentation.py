@@ -91,6 +91,22 @@ def test_a_table_has_the_rows_that_its_request_chooses(tables, monkeypatch):
         tables.table("any", ["solver=none", "seconds"])
 
 
+def test_an_overview_has_the_times_of_each_program_and_dashes_where_there_are_none(tables):
+    def measured(file, column, **wanted):
+        (row,) = (row for row in tables.load(file)["rows"] if all(row.get(n) == v for n, v in wanted.items()))
+        return tables.text(row[column])
+
+    lines = tables.overview(["256²/500", "32³/200"], ROOT / "README.md").splitlines()
+    plane, gradient, volume = ([cell.strip() for cell in line.split("|")[2:-1]] for line in lines[2:5])
+    assert plane[0] == measured("eigensolvers", "seconds", nodes=65536, k=500, solver="eigsh, SuperLU")
+    assert plane[3] == measured("derivatives", "value_s", problem="256²")
+    assert gradient[:2] == ["—", "—"]
+    assert gradient[2] == measured("derivatives", "gradient_first_s", problem="256²")
+    assert gradient[5] == measured("accelerator_h200", "seconds", nodes=65536, k=500, way="gradient of the HKS")
+    assert volume[0] == measured("volumes", "seconds", nodes=32768, solver="eigsh, SuperLU")
+    assert volume[1] == volume[4] == "—"
+
+
 @pytest.mark.parametrize(
     ("value", "power", "expected"),
     [
