@@ -73,6 +73,14 @@ def test_tables_and_plots_are_what_was_measured(tables):
     assert tables.differences() == []
 
 
+def test_the_list_of_references_is_that_of_the_bibliography(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "docs" / "hooks")
+    references = importlib.import_module("references")
+    page = references.PAGE.read_text(encoding="utf-8")
+    assert references.filled() == page
+    assert page.count("\n- ") == len(references.entries()) == references.BIBLIOGRAPHY.read_text("utf-8").count("\n@")
+
+
 def test_a_changed_result_and_one_shown_nowhere_are_told(tables, monkeypatch):
     stored, named = tables.load, tables.named()
     rows = [{"way": "one by one", "seconds": 0.5, "first_call_s": 0.5}]

@@ -17,7 +17,7 @@ ends = [float(signature(tensors + sign * change)[1, 18, 18]) for sign in (1, -1)
 print(float(jnp.sum(gradient * change)), (ends[0] - ends[1]) / 2)
 print(*(float(x) for x in (values.max(axis=(1, 2)) - values[:, 18, 18]) / jnp.ptp(values, axis=(1, 2))))
 """
-"""Code after the README's: a derivative beside a difference quotient, and how far below the maximum the bump's top is."""
+"""Code after the README's: the derivative beside a difference quotient, and how far the top is below the maximum."""
 
 
 @pytest.mark.slow
