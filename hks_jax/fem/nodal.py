@@ -99,6 +99,46 @@ def nodal_pencil(pencil: Pencil) -> NodalPencil:
     return lump(stiffness, mass, *jax.lax.optimization_barrier(tuple(masks)))
 
 
+_ROUND = 4
+"""The sides of a cropped grid are multiples of this number of nodes, so that similar masks share compiled code."""
+_SAVED = 0.8
+"""A grid is cropped if the nodes that remain are at most this fraction."""
+
+
+def cropped(pencil: Pencil) -> Pencil:
+    """Return the pencil on the part of its grid around the domain, with the same unknowns in the same order.
+
+    Along periodic axes the grid stays whole. The pencil is returned unchanged if cropping would save few nodes.
+    """
+    space = pencil.space
+    assert isinstance(space, GridSpace)
+    box = tuple(slice(None) if wraps else _around(space.grid.inside, axis) for axis, wraps in enumerate(space.periodic))
+    inside = space.grid.inside[box]
+    if inside.size > _SAVED * space.free.size:
+        return pencil
+    small = grid_space(Grid(inside.shape, mask=inside, components="all"), space.boundary)
+
+    def part(matrix: Operator) -> Operator:
+        every = (slice(None), *box)
+        return StencilOperator(matrix.coefficients[every], small) if isinstance(matrix, StencilOperator) else matrix
+
+    stiffness, mass = part(pencil.stiffness), part(pencil.mass)
+    assert isinstance(stiffness, StencilOperator)
+    return replace(pencil, stiffness=stiffness, mass=mass, space=small, metric=None, density=None, source=None)
+
+
+def _around(inside: Bool[np.ndarray, "*shape"], axis: int) -> slice:
+    """Return a slice of the nodes along an axis that contains the mask.
+
+    Between the mask and a new end of the axis is at least one node, so that the end is no side of the domain.
+    """
+    n, where = inside.shape[axis], np.flatnonzero(inside.any(axis=tuple(a for a in range(inside.ndim) if a != axis)))
+    first, last = max(where[0] - 1, 0), min(where[-1] + 1, n - 1)
+    size = min(-(-(last + 1 - first) // _ROUND) * _ROUND, n)
+    first = min(first, n - size)
+    return slice(int(first), int(first + size))
+
+
 def to_columns(rows: Float[Array, "b nodes"], shape: tuple[int, ...]) -> Float[Array, "*shape b"]:
     """Return rows of flat nodal arrays as a block of columns."""
     # Optimization barriers keep XLA from fusing the transposition, here and in `to_rows`, with matrix products, which

@@ -129,7 +129,7 @@ class GridSpace(FunctionSpace):
     """
 
     def __init__(self, grid: Grid, boundary: tuple[Sides, ...]) -> None:
-        self.boundary = boundary
+        self.grid, self.boundary = grid.unit, boundary
         self.node_shape, self.dimension = grid.shape, grid.dimension
         *axes, rim = boundary
         self.periodic = tuple(sides == ("periodic", "periodic") for sides in axes)
@@ -152,7 +152,7 @@ class GridSpace(FunctionSpace):
                 "finer grid or a thicker mask"
             )
         self._labels, self.n_components = label_nodes(grid.inside, self.periodic)
-        self._key = (grid.unit, boundary)
+        self._key = (self.grid, boundary)
 
     @cached_property
     def cells(self) -> Int[np.ndarray, "E n"]:

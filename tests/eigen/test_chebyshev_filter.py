@@ -13,7 +13,7 @@ import hks_jax as hj
 from hks_jax.eigen.filter import chebyshev_filter
 from hks_jax.eigen.filter.coarsening import coarsen, interpolate
 from hks_jax.eigen.filter.polynomial import MOST_DEGREE, Band, correction, upper_end
-from hks_jax.fem.nodal import nodal_pencil, to_columns, to_rows
+from hks_jax.fem.nodal import cropped, nodal_pencil, to_columns, to_rows
 
 
 def masked(shape):
@@ -125,6 +125,29 @@ def test_the_compiler_computes_nothing_with_the_grid(name, masks):
     large = [var for var, value in zip(traced.jaxpr.constvars, traced.consts, strict=True) if np.size(value) > 64]
     uses = {equation.primitive.name for equation in traced.eqns if set(map(id, large)) & set(map(id, equation.invars))}
     assert (len(large), uses) == (masks, {"optimization_barrier"} if masks else set())
+
+
+@pytest.mark.parametrize(
+    ("shape", "boundary", "smaller"),
+    [
+        ((40, 30, 20), "neumann", (24, 20, 16)),
+        ((40, 30, 20), "dirichlet", (24, 20, 16)),
+        ((40, 30, 20), (("dirichlet", "neumann"), "periodic", ("neumann", "dirichlet")), (24, 30, 16)),
+        ((60, 50), ("periodic", "neumann", "dirichlet"), (60, 32)),
+        ((20, 18), "neumann", (20, 18)),
+    ],
+)
+def test_a_cropped_grid_has_the_same_matrices(rng, shape, boundary, smaller):
+    centre, radii = [10, *(n // 2 for n in shape[1:])], [10.5, *(0.28 * n for n in shape[1:])]
+    away = (np.moveaxis(np.indices(shape), 0, -1) - centre) / radii
+    grid = hj.Grid(shape, 0.1, mask=(away**2).sum(axis=-1) < 1, components="largest")
+    pencil = hj.assemble(hj.TensorField(grid, random_spd(rng, shape)), boundary)
+    small = cropped(pencil)
+    assert small.space.node_shape == smaller
+    for name in ("stiffness", "mass"):
+        matrices = (getattr(each, name).to_scipy().toarray() for each in (pencil, small))
+        np.testing.assert_array_equal(*matrices)
+    np.testing.assert_array_equal(pencil.space.null_labels, small.space.null_labels)
 
 
 def test_the_correction_is_the_polynomial_it_is_derived_from(rng):
