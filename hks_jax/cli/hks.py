@@ -28,7 +28,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hks_jax import SurfaceMesh, TensorNoise, TetMesh
+from hks_jax import TensorNoise
 from hks_jax.cli import pairs as saved_pairs
 from hks_jax.cli.computation import Settings, compute_pairs, result_of, use_dtype
 from hks_jax.cli.info import describe_mesh
@@ -40,7 +40,6 @@ from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import read_volume, require_metric
 from hks_jax.io.formats import format_of
 from hks_jax.io.mesh import is_mesh
-from hks_jax.io.result import Result
 
 OPTIONS = f"""
 @file @metric {READING} @output {SOLVING}
@@ -101,6 +100,8 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
 
 
 def _on_mesh(args: argparse.Namespace, settings: Settings, progress: Progress) -> Done:
+    from hks_jax.plot import signature_panels
+
     domain = domain_of(args, progress)
     mesh, noisy = domain.mesh, _noise_on(domain, args, progress)
     pairs, settings = solve_mesh(mesh, settings, progress)
@@ -110,7 +111,7 @@ def _on_mesh(args: argparse.Namespace, settings: Settings, progress: Progress) -
         result = of_pairs(settings, progress)
     else:
         result = with_error_bars(args, of_pairs, noisy, pairs, settings, progress)
-    drawing = partial(_draw_mesh, result, args.show_rim)
+    drawing = partial(signature_panels, result, show_rim=args.show_rim)
     images, origin = images_of_mesh(args.file, mesh, args.clean)
     return write_outputs(args.output, result, progress, drawing, *images, origin=origin)
 
@@ -132,23 +133,3 @@ def _noise_on(domain: Domain, args: argparse.Namespace, progress: Progress) -> N
             f"--noise: got {args.noise!r}; expected a number, relative to the mean diffusivity, for tensors of a mesh"
         ) from None
     return Noisy(domain.tensors, TensorNoise.relative(domain.tensors, level), domain.of_tensors)
-
-
-def _draw_mesh(result: Result, show_rim: bool, path: Path) -> None:
-    """Draw the signature on the surface, or on the boundary of a solid, with a separate colour scale for each time."""
-    from hks_jax.plot.images import colours_of
-    from hks_jax.plot.signature import LEAST_RANGE, caption, legend, nodes_for_colours, titles_of
-    from hks_jax.plot.surfaces import surface_panels
-
-    mesh = result.place
-    assert isinstance(mesh, SurfaceMesh | TetMesh)
-    cells, near = mesh.triangulation, None if show_rim else result.near_rim
-    visible = cells.boundary_vertices if isinstance(mesh, TetMesh) else cells.used
-    words = legend(result, near)
-    if near is not None and near[:, visible].all():  # as on the boundary of a solid, where hatching would show nothing
-        near, words = None, ["the boundary contributes over 10 % at all vertices"]
-    centre = 1.0 if result.normalisation == "flat" else None
-    shown = [values[nodes] for values, nodes in zip(result.values, nodes_for_colours(result, visible), strict=True)]
-    colours = colours_of(shown, least_range=LEAST_RANGE, centre=centre)
-    suptitle = "\n".join([caption(result), *words])
-    surface_panels(mesh, list(result.values), titles_of(result), colours, hatched=near, suptitle=suptitle, path=path)
