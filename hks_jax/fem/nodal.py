@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -108,23 +109,24 @@ _SAVED = 0.8
 def cropped(pencil: Pencil) -> Pencil:
     """Return the pencil on the part of its grid around the domain, with the same unknowns in the same order.
 
-    Along periodic axes the grid stays whole. The pencil is returned unchanged if cropping would save few nodes.
+    Along periodic axes the grid stays whole. The pencil is returned unchanged if cropping would save few nodes, or if
+    it is not that of functions on a grid.
     """
     space = pencil.space
-    assert isinstance(space, GridSpace)
+    if not isinstance(space, GridSpace):
+        return pencil
     box = tuple(slice(None) if wraps else _around(space.grid.inside, axis) for axis, wraps in enumerate(space.periodic))
     inside = space.grid.inside[box]
     if inside.size > _SAVED * space.free.size:
         return pencil
     small = grid_space(Grid(inside.shape, mask=inside, components="all"), space.boundary)
 
-    def part(matrix: Operator) -> Operator:
+    def part(matrix: Any) -> Any:
         every = (slice(None), *box)
         return StencilOperator(matrix.coefficients[every], small) if isinstance(matrix, StencilOperator) else matrix
 
-    stiffness, mass = part(pencil.stiffness), part(pencil.mass)
-    assert isinstance(stiffness, StencilOperator)
-    return replace(pencil, stiffness=stiffness, mass=mass, space=small, metric=None, density=None, source=None)
+    parts = {"stiffness": part(pencil.stiffness), "mass": part(pencil.mass), "space": small}
+    return replace(pencil, **parts, metric=None, density=None, source=None)
 
 
 def _around(inside: Bool[np.ndarray, "*shape"], axis: int) -> slice:

@@ -15,6 +15,7 @@ from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.assembly import assemble
 from hks_jax.fem.boundary import BoundarySpec
+from hks_jax.fem.nodal import cropped
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.resolution import mean_diffusivity
 from hks_jax.linear.chebyshev import chebyshev_heat_coefficients, chebyshev_recurrence, least_degree
@@ -100,7 +101,7 @@ def smooth(
         )
     time = fwhm**2 / (16 * math.log(2.0) * diffusivity)
     degree = least_degree(time * top / 2, max(_OMITTED, float(jnp.finfo(dtype).eps)))
-    smoothed = _flow(degree, pencil, jnp.asarray(top, dtype), jnp.asarray(time, dtype), rows)
+    smoothed = _flow(degree, cropped(pencil), jnp.asarray(top, dtype), jnp.asarray(time, dtype), rows)
     return space.extend(smoothed).reshape(u.shape)
 
 

@@ -8,6 +8,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.sharding import Mesh, NamedSharding
 from jaxtyping import Array, Bool, Float
 
@@ -153,7 +154,11 @@ def _converge(grid: GridFilter, rounding: Array, state: FilterState, max_rounds:
     pace = Pace(float(jnp.max(excess(state))))
     in_steps = grid.plan.mesh is None and state.vectors.size >= _LARGE
     while going_on(state):
-        text = f"{int(jnp.sum(excess(state) <= 1))} of {wanted} pairs, round {int(state.rounds) + 1}"
+        beyond = np.asarray(excess(state))
+        text = (
+            f"round {int(state.rounds) + 1}: {int((beyond <= 1).sum())} of {wanted} pairs, residuals up to "
+            f"{float(beyond.max()) * grid.plan.tolerance:.0e} (wanted {grid.plan.tolerance:.0e})"
+        )
         report(Status(text, pace.seconds_left()))
 
         def tell(done: int, of: int, text: str = text) -> None:
