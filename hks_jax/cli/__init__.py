@@ -15,9 +15,11 @@ import _thread
 import argparse
 import io
 import os
+import re
 import sys
 import threading
 from collections.abc import Sequence
+from types import ModuleType
 from typing import Any, NoReturn
 
 import jax
@@ -26,22 +28,26 @@ import numpy as np
 from hks_jax import __version__
 from hks_jax.cache import keep_compiled
 from hks_jax.cli import convert, curvature, demo, explore, fit, hks, info, modes, plot, smooth, spectrum, stats
+from hks_jax.cli.computation import INPUT_ERRORS
 from hks_jax.cli.inputs import require_inputs_kept
-from hks_jax.cli.options import SPELLED, add_command, as_options
+from hks_jax.cli.options import COLUMNS, FILES, add_common, of_arguments
 from hks_jax.cli.outputs import show
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.study import batch
+from hks_jax.io.formats import WRITTEN
+from hks_jax.io.mesh import READ as MESHES
+from hks_jax.naming import named_as_options, with_option
 
 COMMANDS = (hks, modes, smooth, spectrum, curvature, fit, batch, stats, plot, explore, info, convert, demo)
-"""A module for each command: its docstring is the help text, `OPTIONS` lists its options, and `run` runs it.
+"""A module for each command: its docstring is the help text, `add_options` adds its options, and `run` runs it.
 
-The function `writes` of commands with input files returns the files that the command may write.
+`USAGE` has the required arguments. The function `writes` of commands with input files returns the files that the
+command may write.
 """
+_LISTS = {"meshes": MESHES, "written": WRITTEN, "files": FILES, "columns": COLUMNS}
+"""Lists that a module's docstring may name in braces."""
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
-
-# Errors that a user can correct: wrong values, missing files, missing extras. Any other error is a failed computation.
-INPUT_ERRORS = (ValueError, FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError, ImportError)
 
 
 class Parser(argparse.ArgumentParser):
@@ -60,8 +66,28 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"hks-jax {__version__}")
     subparsers = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for command in COMMANDS:
-        add_command(subparsers, command)
+        _add_command(subparsers, command)
     return parser
+
+
+def _add_command(subparsers: Any, command: ModuleType) -> None:
+    """Add the parser of a command."""
+    lists = {name: ", ".join(words) for name, words in _LISTS.items()}
+    summary, _, text = (command.__doc__ or "").format(**lists).partition("\n\n")
+    description, *examples = re.split(r"\n(?=examples?:)", text)
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        command.__name__.rpartition(".")[2],
+        help=summary[:1].lower() + summary[1:].rstrip("."),
+        usage=" ".join(filter(None, ("%(prog)s", command.USAGE, "[options]"))),
+        description=description,
+        epilog="".join(examples),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    # A word that begins with a minus and a digit is a point, such as -20,35, and not an option.
+    parser._negative_number_matcher = re.compile(r"-[\d.]")
+    command.add_options(parser)
+    add_common(parser)
+    parser.set_defaults(run=command.run, command=command, prog=parser.prog)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -81,6 +107,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             Parser(prog=args.prog).error(f"unrecognized arguments: {' '.join(unknown)}")
     except SystemExit as stop:  # argparse has printed the message
         return int(stop.code or 0)
+    with named_as_options(of_arguments(args)):
+        return _run(args)
+
+
+def _run(args: argparse.Namespace) -> int:
     progress = Progress(args.quiet)
     try:
         if args.no_cache:
@@ -97,7 +128,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except np.linalg.LinAlgError as error:
         return _fail(args, str(error), FAILED, error)
     except INPUT_ERRORS as error:
-        return _fail(args, as_options(str(error), [name for name in SPELLED if name in args]), BAD_INPUT, error)
+        return _fail(args, with_option(str(error)), BAD_INPUT, error)
     except Exception as error:
         return _fail(args, f"{type(error).__name__}: {error}", FAILED, error)
     return 0

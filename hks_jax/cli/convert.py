@@ -14,19 +14,23 @@ import argparse
 import sys
 from pathlib import Path
 
+from hks_jax.cli import options
 from hks_jax.cli.computation import describe_input
-from hks_jax.cli.options import READING
 from hks_jax.cli.outputs import Done
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import read
+from hks_jax.cli.reading import Reading, read
 from hks_jax.io import find_invalid, save_tensors
 from hks_jax.io.formats import WRITTEN
 from hks_jax.io.repair import describe_invalid
 
-OPTIONS = f"""
-@file {READING}
-output OUT  the file to write; an existing file is replaced
-"""
+USAGE = "FILE OUT"
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    options.add_file(parser)
+    options.add_reading(parser)
+    parser.add_argument("output", type=Path, metavar="OUT", help="the file to write; an existing file is replaced")
 
 
 def writes(args: argparse.Namespace) -> list[Path]:
@@ -40,7 +44,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         raise ValueError(f"OUT: got {args.output}; expected a name that ends in {', '.join(WRITTEN)}")
     if args.output.is_dir():
         raise IsADirectoryError(f"OUT: got the folder {args.output}; expected a file")
-    volume = read(args, progress)
+    volume = read(Reading.of(args), progress)
     if (bad := find_invalid(volume)).any():
         progress.warn(f"{int(bad.sum())} tensors are {describe_invalid(volume, bad)}; written unchanged, see --repair")
     with progress.stage("writing", str(args.output)):

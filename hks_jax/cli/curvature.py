@@ -17,20 +17,34 @@ from typing import Any
 
 import numpy as np
 
-from hks_jax.cli.computation import Settings, describe_input, field_of
-from hks_jax.cli.options import READING, refuse
+from hks_jax.cli import options
+from hks_jax.cli.computation import Settings, domain_of_volume
+from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import read_volume
+from hks_jax.cli.reading import Reading, read_volume
 from hks_jax.curvature import gaussian_curvature
 from hks_jax.io import Result
 from hks_jax.io.formats import WRITTEN, format_of
 
-OPTIONS = f"""
-@file @metric {READING} @domain @dtype @output
---periodic x|y|xy  periodic axes, along which the first node follows the last (default none)
-@view
-"""
+USAGE = "FILE -o OUT"
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    options.add_file(parser)
+    options.add_metric(parser)
+    options.add_reading(parser)
+    options.add_components(parser)
+    options.add_dtype(parser)
+    options.add_output(parser)
+    parser.add_argument(
+        "--periodic",
+        choices=("x", "y", "xy"),
+        help="periodic axes, along which the first node follows the last (default none)",
+    )
+    options.add_view(parser)
+
 
 COLOURED = 0.98
 """The quantile of absolute values at the ends of the colour scale; the curvature of noisy tensors has outliers."""
@@ -46,15 +60,16 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     from hks_jax.plot import hks_panels
     from hks_jax.plot.signature import cropped, placed
 
-    volume, settings, periodic = read_volume(args, progress), Settings.of(args), args.periodic or ""
+    volume, settings, periodic = read_volume(Reading.of(args), progress), Settings.of(args), args.periodic or ""
     refuse(args, ("operator",), "the curvature is that of a metric; pass --metric inverse for that of D⁻¹")
     if volume.dimension != 2:
         raise ValueError(
             f"--slice: got tensors on a volume of shape {volume.shape}; expected two dimensions for the Gaussian "
             "curvature. Choose a slice, such as --slice z=14"
         )
-    field = field_of(volume, volume.grid(args.components), settings)
-    volume, inside = volume.with_mask(field.grid.mask), field.grid.inside
+    domain = domain_of_volume(volume, settings)
+    volume, field = domain.place, domain.field
+    inside = field.grid.inside
     with progress.stage("curvature", f"{int(inside.sum())} nodes"):
         curvature = np.asarray(gaussian_curvature(field, ["x" in periodic, "y" in periodic]))
     known = np.isfinite(curvature)
@@ -65,7 +80,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     density = np.sqrt(np.linalg.det(np.asarray(field.domain_tensors, np.float64)))[known]
     values = curvature[known].astype(np.float64)
     report = {
-        "input": describe_input(volume),
+        "input": domain.about,
         "settings": {"metric": settings.metric, "periodic": periodic, "dtype": settings.dtype},
         "curvature": {
             "nodes": int(known.sum()),

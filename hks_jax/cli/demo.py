@@ -13,20 +13,28 @@ import argparse
 import importlib.util
 from functools import partial
 
-from hks_jax.cli.computation import Settings, compute_pairs
+from hks_jax.cli import options
+from hks_jax.cli.computation import Settings, compute_pairs, domain_of_volume
 from hks_jax.cli.noise import signature_of
 from hks_jax.cli.outputs import Done, write_outputs
-from hks_jax.cli.parsing import Times
+from hks_jax.cli.parsing import Times, folder
 from hks_jax.cli.progress import Progress
 from hks_jax.domain import examples
 from hks_jax.io import TensorVolume, erode, find_example_brain, fit_dwi
 from hks_jax.io.units import MM2_PER_S
 
-OPTIONS = """
--o,--output OUT = demo  folder for the results
---phantom  use the phantom even if the brain is installed
-@view @rim
-"""
+USAGE = ""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    parser.add_argument(
+        "-o", "--output", type=folder, default="demo", metavar="OUT", help="folder for the results (default demo)"
+    )
+    parser.add_argument("--phantom", action="store_true", help="use the phantom even if the brain is installed")
+    options.add_view(parser)
+    options.add_rim(parser)
+
 
 B_MAX = 1000.0
 """The largest b-value, in s/mm², up to which a single tensor describes the signal well."""
@@ -55,7 +63,8 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
             volume = fit_dwi(brain.images, brain.bval, brain.bvec, brain.mask, b_max=B_MAX).slice("z", 0)
             volume = volume.with_mask(erode(volume.inside, RIM))
     settings = Settings.of(metric="inverse", components="largest", k=N_PAIRS, times=Times((), N_TIMES))
-    result = signature_of(args, compute_pairs(volume, settings, progress), None, progress)
+    solved = compute_pairs(domain_of_volume(volume, settings), settings, progress)
+    result = signature_of(solved, None, progress)
     title = (
         rf"$4\pi t\,$HKS of {'a phantom' if brain is None else 'a brain slice'}, metric D⁻¹. The value 1 means flat; "
         "larger values mean positive curvature"

@@ -15,26 +15,47 @@ examples:
 import argparse
 from pathlib import Path
 
+from hks_jax.cli import options
 from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import Done
+from hks_jax.cli.parsing import file_in_folder
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.stats import names_of
 from hks_jax.io import sample_image
 from hks_jax.io.masks import read_labels
 from hks_jax.io.result import Result, signature_file
 
-OPTIONS = """
-result RESULT  the folder OUT that 'hks-jax hks' wrote, or an .npz from there
--o,--output PAGE  the page (default: explore.html in OUT)
---labels FILE  region numbers on the same voxels or at the vertices, with 0 for unlabelled (NIfTI, MRtrix, NRRD or .npy)
-@names
---anatomy FILE
-    an anatomical image, such as a T1-weighted one in the space of the tensors, which lies in grey under the signature.
-    It is interpolated at the voxels of the result through the affines (NIfTI, MRtrix or NRRD)
---title TEXT  the page's title (default: the name of the tensors' file)
---unit-of-t TEXT  unit of t, if the result does not have it (default: that of the result)
-@view
-"""
+USAGE = "RESULT"
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    parser.add_argument(
+        "result", type=Path, metavar="RESULT", help="the folder OUT that 'hks-jax hks' wrote, or an .npz from there"
+    )
+    parser.add_argument(
+        "-o", "--output", type=file_in_folder, metavar="PAGE", help="the page (default: explore.html in OUT)"
+    )
+    parser.add_argument(
+        "--labels",
+        type=Path,
+        metavar="FILE",
+        help="region numbers on the same voxels or at the vertices, with 0 for unlabelled (NIfTI, MRtrix, NRRD or "
+        ".npy)",
+    )
+    options.add_names(parser)
+    parser.add_argument(
+        "--anatomy",
+        type=Path,
+        metavar="FILE",
+        help="an anatomical image, such as a T1-weighted one in the space of the tensors, which lies in grey under "
+        "the signature. It is interpolated at the voxels of the result through the affines (NIfTI, MRtrix or NRRD)",
+    )
+    parser.add_argument("--title", metavar="TEXT", help="the page's title (default: the name of the tensors' file)")
+    parser.add_argument(
+        "--unit-of-t", metavar="TEXT", help="unit of t, if the result does not have it (default: that of the result)"
+    )
+    options.add_view(parser)
 
 
 def writes(args: argparse.Namespace) -> list[Path]:

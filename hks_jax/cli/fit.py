@@ -22,52 +22,121 @@ from typing import Any
 import numpy as np
 
 from hks_jax import Grid, TensorField
+from hks_jax.cli import options
 from hks_jax.cli.computation import ComputationError, use_dtype
-from hks_jax.cli.options import FORMATS, refuse
+from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import REPORT, Done, writing
+from hks_jax.cli.parsing import boundary_conditions, weight
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import require_one
 from hks_jax.domain.tensor_field import diffusion_tensors
 from hks_jax.fem.boundary import unreached_sides
-from hks_jax.io import find_invalid, read_tensors, save, save_tensors
+from hks_jax.io import ORDERS, find_invalid, read_tensors, save, save_tensors
 from hks_jax.io.formats import format_of
 from hks_jax.io.repair import describe_invalid
 from hks_jax.io.result import Result, plain, tuples
 from hks_jax.io.volume import TensorVolume, digest, require_position
 
-OPTIONS = f"""
-target TARGET  the signature, an .npz file or the folder of a signature
-@output
---init FILE  the initial tensors: {FORMATS} (default: identity)
---metric tensor|inverse|adjugate
-    the metric of the tensors D in --init: inverse is D⁻¹, tensor is D itself, adjugate is |D|D⁻¹. This option is
-    required except for NumPy's files without a unit of length, whose tensors are the metric by default, and for
-    --operator fick
---operator laplace-beltrami|fick
-    the operator of the target, as for 'hks-jax hks' (default: the operator in TARGET, otherwise laplace-beltrami). With
-    fick, tensors.npz contains the diffusivity D
---order ORDER  order of the components in --init, if the file does not declare it
-@interpolation
---parametrisation log-euclidean|cholesky|conformal|eigenvalues|rotation = log-euclidean
-    the unknowns of the fit: the whole tensor, as log-euclidean (default) or cholesky; or only a conformal factor, the
-    eigenvalues, or the rotation of the tensors in --init
---boundary CONDITION
-    the boundary condition of the target, as for 'hks-jax hks' (default: the condition in TARGET, otherwise neumann)
--k K  number of eigenpairs (default: enough for all but 1e-6 of the heat trace at the smallest time)
---noise SIGMA  standard deviation of the logarithm of the target (0.01 for 1 %); the fit stops at this misfit
---smoothness LENGTH
-    smoothing length of the steps, in coordinate units (default a tenth of the domain, or 0 for conformal without
-    --noise)
---h1 WEIGHT  penalise slopes of the unknowns p by ½ · WEIGHT · mean |∇p|²
---tv WEIGHT  penalise the total variation, which keeps edges sharp
---max-steps N = 50  largest number of steps per stage
---continuation N = 1  number of stages; each stage adds smaller times
---starts N = 1  number of starts; all but the first begin at random perturbations of --init
---seed N = 0  seed of the random perturbations
---optimiser gauss-newton|lbfgs|bfgs = gauss-newton  optimisation method
---checkpoint FILE  file that is written after each step; if the file exists, the fit continues from it
-@dtype @view
-"""
+USAGE = "TARGET -o OUT"
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    parser.add_argument(
+        "target", type=Path, metavar="TARGET", help="the signature, an .npz file or the folder of a signature"
+    )
+    options.add_output(parser)
+    parser.add_argument(
+        "--init", type=Path, metavar="FILE", help=f"the initial tensors: {options.FORMATS} (default: identity)"
+    )
+    parser.add_argument(
+        "--metric",
+        choices=("tensor", "inverse", "adjugate"),
+        help="the metric of the tensors D in --init: inverse is D⁻¹, tensor is D itself, adjugate is |D|D⁻¹. This "
+        "option is required except for NumPy's files without a unit of length, whose tensors are the metric by "
+        "default, and for --operator fick",
+    )
+    parser.add_argument(
+        "--operator",
+        choices=("laplace-beltrami", "fick"),
+        help="the operator of the target, as for 'hks-jax hks' (default: the operator in TARGET, otherwise "
+        "laplace-beltrami). With fick, tensors.npz contains the diffusivity D",
+    )
+    parser.add_argument(
+        "--order", choices=tuple(ORDERS), help="order of the components in --init, if the file does not declare it"
+    )
+    options.add_interpolation(parser)
+    parser.add_argument(
+        "--parametrisation",
+        choices=("log-euclidean", "cholesky", "conformal", "eigenvalues", "rotation"),
+        default="log-euclidean",
+        help="the unknowns of the fit: the whole tensor, as log-euclidean (default) or cholesky; or only a conformal "
+        "factor, the eigenvalues, or the rotation of the tensors in --init",
+    )
+    parser.add_argument(
+        "--boundary",
+        type=boundary_conditions,
+        metavar="CONDITION",
+        help="the boundary condition of the target, as for 'hks-jax hks' (default: the condition in TARGET, otherwise "
+        "neumann)",
+    )
+    parser.add_argument(
+        "-k",
+        type=int,
+        metavar="K",
+        help="number of eigenpairs (default: enough for all but 1e-6 of the heat trace at the smallest time)",
+    )
+    parser.add_argument(
+        "--noise",
+        type=float,
+        metavar="SIGMA",
+        help="standard deviation of the logarithm of the target (0.01 for 1 %%); the fit stops at this misfit",
+    )
+    parser.add_argument(
+        "--smoothness",
+        type=float,
+        metavar="LENGTH",
+        help="smoothing length of the steps, in coordinate units (default a tenth of the domain, or 0 for conformal "
+        "without --noise)",
+    )
+    parser.add_argument(
+        "--h1", type=weight, metavar="WEIGHT", help="penalise slopes of the unknowns p by ½ · WEIGHT · mean |∇p|²"
+    )
+    parser.add_argument(
+        "--tv", type=weight, metavar="WEIGHT", help="penalise the total variation, which keeps edges sharp"
+    )
+    parser.add_argument(
+        "--max-steps", type=int, default=50, metavar="N", help="largest number of steps per stage (default 50)"
+    )
+    parser.add_argument(
+        "--continuation",
+        type=int,
+        default=1,
+        metavar="N",
+        help="number of stages; each stage adds smaller times (default 1)",
+    )
+    parser.add_argument(
+        "--starts",
+        type=int,
+        default=1,
+        metavar="N",
+        help="number of starts; all but the first begin at random perturbations of --init (default 1)",
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the random perturbations (default 0)")
+    parser.add_argument(
+        "--optimiser",
+        choices=("gauss-newton", "lbfgs", "bfgs"),
+        default="gauss-newton",
+        help="optimisation method (default gauss-newton)",
+    )
+    parser.add_argument(
+        "--checkpoint",
+        type=Path,
+        metavar="FILE",
+        help="file that is written after each step; if the file exists, the fit continues from it",
+    )
+    options.add_dtype(parser)
+    options.add_view(parser)
 
 
 _NO_METRIC = "--metric: choose inverse, tensor or adjugate, because --init has diffusion tensors and not a metric"
@@ -98,7 +167,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
                 "Compute it by 'hks-jax hks' without --normalisation"
             )
         args.operator = args.operator or target.settings.get("operator", "laplace-beltrami")
-        require_one(args)
+        require_one(args.metric, args.operator)
         if target.normalisation == "flat":
             target = replace(target, values=target.values / target.to_flat)
         # The mask is the domain of the computed signature, so all of its components belong to the domain.

@@ -16,6 +16,7 @@ import argparse
 import json
 import math
 import shlex
+from collections.abc import Mapping
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -23,11 +24,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from hks_jax.cli import options
 from hks_jax.cli.computation import times_in_words
-from hks_jax.cli.options import READING, as_options
 from hks_jax.cli.pairs import arrays_in
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import outside_note, read, without_element
+from hks_jax.cli.reading import Reading, outside_note, read, without_element
 from hks_jax.domain.components import label_nodes
 from hks_jax.domain.simplices import WORDS, signed_measure
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
@@ -39,9 +40,17 @@ from hks_jax.io.repair import least_admissible
 from hks_jax.io.result import NAMES, Result, signature_file
 from hks_jax.io.units import MEDIAN, MM2_PER_S, by_axis, is_plausible, unit_of_times
 from hks_jax.io.volume import digest
+from hks_jax.naming import with_option
 from hks_jax.signatures.times import FREE, suitable, suitable_times
 
-OPTIONS = f"@file {READING} @clean"
+USAGE = "FILE"
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    options.add_file(parser)
+    options.add_reading(parser)
+    options.add_clean(parser)
 
 
 def run(args: argparse.Namespace, progress: Progress) -> None:
@@ -56,7 +65,10 @@ def run(args: argparse.Namespace, progress: Progress) -> None:
         description = {"file": str(args.file), **describe_mesh(args.file, read_mesh(args.file, clean=args.clean))}
         description["arrays"] = listed(arrays_by_place(args.file, args.clean))
     else:
-        description = {**describe(args.file, read(args, progress, questions.append)), "questions": questions}
+        description = {
+            **describe(args.file, read(Reading.of(args), progress, questions.append)),
+            "questions": questions,
+        }
     print(json.dumps(description, indent=2, ensure_ascii=False) if args.json else "\n".join(_lines(description)))
 
 
@@ -159,7 +171,7 @@ def describe_mesh(path: Path, mesh: SimplicialMesh) -> dict[str, Any]:
     }
 
 
-def listed(arrays: dict[str, dict[str, np.ndarray]]) -> list[dict[str, Any]]:
+def listed(arrays: Mapping[str, Mapping[str, np.ndarray]]) -> list[dict[str, Any]]:
     """Return the names, places and numbers of components of a mesh's arrays."""
     return [
         {"name": name, "at": at, "components": math.prod(values.shape[1:])}
@@ -196,7 +208,7 @@ def _lines(description: dict[str, Any]) -> list[str]:
             f"tensors         {by_axis(description['shape'])}, {description['dtype']}, {placed}",
             f"spacing         {by_axis(description['spacing'])}{length}",
             f"order, frame    {description['order']}, {description['frame']} axes",
-            *(f"                {as_options(note)}" for note in description["notes"]),
+            *(f"                {with_option(note)}" for note in description["notes"]),
             f"inside          {description['inside']} voxels{'' if description['masked'] else ' (no mask)'}",
             f"components      {description['components']}{f' ({sizes} nodes)' if sizes else ': the domain is empty'}",
             f"boundary        {description['boundary']} by default"
@@ -206,7 +218,7 @@ def _lines(description: dict[str, Any]) -> list[str]:
             lines.append(f"                {outside_note(description['without_element'])}")
         lines.append(f"invalid         {bad} tensors are not positive definite")
         if "question" in description:
-            lines.append(f"                {as_options(description['question'])}")
+            lines.append(f"                {description['question']}")
         elif bad > MANY * description["inside"]:
             lines.append(
                 "                noise does not explain this; for naturally indefinite tensors, see --positive"

@@ -1,4 +1,4 @@
-"""Find the input files of a command, and refuse outputs that would replace them."""
+"""Refuse outputs of a command that would replace its input files."""
 
 import argparse
 from collections.abc import Iterator
@@ -6,43 +6,29 @@ from contextlib import suppress
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from hks_jax.cli.noise import second_scan
-from hks_jax.cli.options import flag, options_in
+from hks_jax.cli.options import flag
+from hks_jax.cli.reading import Reading
 from hks_jax.io.masks import names_beside
-from hks_jax.io.nifti import is_nifti, siblings, sidecar_of
 from hks_jax.io.result import signature_file
 
-_INPUTS = ("FILE", "RESULT", "SUBJECTS", "TARGET")
-"""The words in the table of options that stand for input files."""
-
-
-def tensor_files(args: argparse.Namespace) -> dict[str, list[str]]:
-    """Return the files from which the tensors of a volume are read, grouped by role."""
-    images = [args.file, *args.others]
-    if not args.others and args.bval is None:
-        images = siblings(args.file)
-    sidecar = sidecar_of(images[0]) if args.bval is None and is_nifti(images[0]) else None
-    sidecars = [] if sidecar is None or not sidecar.is_file() else [sidecar]
-    given = {"file": images, "sidecar": sidecars, "mask": [args.mask], "bval": [args.bval], "bvec": [args.bvec]}
-    inputs = {role: [str(path) for path in paths if path is not None] for role, paths in given.items()}
-    if (second := second_scan(args)) is not None:
-        of_second = tensor_files(second)
-        inputs["noise"] = [*of_second["file"], *of_second["sidecar"]]
-    return inputs
+INPUTS = (
+    *("file", "result", "subjects", "target", "bval", "bvec", "mask", "tensors", "mesh", "inside", "map", "init"),
+    *("anatomy", "labels", "atlas", "names", "checkpoint"),
+)
+"""The options whose values are input files."""
 
 
 def _inputs(args: argparse.Namespace) -> Iterator[tuple[str, Path]]:
     """Yield the options and the paths of the existing input files of a command."""
-    names = [option.name for option in options_in(args.command.OPTIONS) if option.settings.get("metavar") in _INPUTS]
     given = vars(args)
-    for name in dict.fromkeys(["file", *names]):
+    for name in INPUTS:
         path = given.get(name)
         if path is not None:
             yield flag(name), signature_file(path)
     implied = [*given.get("others", ())]
     implied += [names_beside(given[name]) for name in ("atlas", "labels") if given.get(name) is not None]
     with suppress(Exception):  # reading reports missing and damaged files
-        implied += [path for paths in tensor_files(args).values() for path in paths]
+        implied += [path for paths in Reading.of(args).files.values() for path in paths]
     yield from (("FILE", Path(path)) for path in implied if path is not None)
 
 

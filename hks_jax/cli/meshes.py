@@ -1,105 +1,77 @@
-"""Read a mesh, with the metric that tensors give it, from the options of meshes, and compute its eigenpairs."""
+"""Read a mesh, with the metric that tensors give it, from the options of meshes."""
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool
 
-from hks_jax import Eigenpairs, SurfaceMesh, TetMesh, assemble
-from hks_jax.cli.computation import Settings, solve, use_dtype
-from hks_jax.cli.info import listed
-from hks_jax.cli.options import READING, options_in, refuse
+from hks_jax import TetMesh
+from hks_jax.cli.computation import Domain, Mesh, OfMesh, Settings, use_dtype
+from hks_jax.cli.info import describe_mesh, listed
+from hks_jax.cli.options import add_reading, defaults, refuse
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import read, require_one
-from hks_jax.domain.tensor_checks import Interpolation, MetricChoice, OperatorChoice
+from hks_jax.cli.reading import Reading, read, require_one
 from hks_jax.fem.assembly import MESH_BOUNDARIES
-from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.io import TensorVolume, read_mask, read_mesh, sample_tensors
 from hks_jax.io.cortex import MAPS, structure_of
 from hks_jax.io.mesh import WRITTEN, arrays_by_place, is_surface
 from hks_jax.io.repair import require_valid
+from hks_jax.io.sampling import OutsideMaskError
 from hks_jax.io.tensor_order import Order, matrices
 from hks_jax.optional import optional
-
-Mesh: TypeAlias = SurfaceMesh | TetMesh
-
-OF_VERTICES = """\
-@clean
---inside FILE
-    vertices of a mesh that form the domain, such as a cortical surface without its medial wall: FreeSurfer's .label, or
-    zeros and ones in .npy or in the array 'mask' of an .npz"""
-OF_MESHES = f"""\
-{OF_VERTICES}
---tensors FILE
-    tensors of a volume that contains the mesh (a cortical surface, for example). The tensors are interpolated at the
-    vertices in scanner coordinates (FreeSurfer's surfaces are moved by c_ras, GIFTI's by their transformation). The
-    options on voxels and on the meaning of numbers refer to this file"""
-"""The options of meshes."""
 
 OF_TENSORS = ("metric", "operator", "order", "interpolation")
 """Options that refer to tensors of a mesh."""
 NO_NOISE = "this option needs tensors; saved eigenpairs and meshes with the Euclidean metric have none. Leave it out"
 
 
-class Domain(NamedTuple):
-    """A mesh with a metric, the tensors behind the metric, and the function from such tensors to the mesh."""
+class MeshFile(NamedTuple):
+    """The file of a mesh and how to read it, with the names of the options; `around` has the tensors of a volume."""
 
-    mesh: Mesh
-    tensors: np.ndarray | None  # at the vertices or cells of the mesh, or at the voxels of the volume
-    volume: TensorVolume | None
-    of_tensors: Callable[[Any], Mesh] | None
+    file: Path
+    clean: bool
+    inside: Path | None
+    array: str | None
+    order: Order | None
+    around: Reading | None
+
+    @classmethod
+    def of(cls, args: argparse.Namespace, file: Path) -> "MeshFile":
+        """Return the options in `args`; raise ValueError for a boundary condition or options that meshes lack."""
+        of_grids = ["slice", "through", "view", "save_pairs", "components", "method"]
+        if not args.tensors:  # with --tensors, the options for reading refer to the volume
+            of_grids += [name for name in defaults(add_reading) if name not in ("order", "array")]
+        elif args.array:
+            raise ValueError("--tensors, --array: got both; expected tensors either in a volume or in the mesh's file")
+        refuse(args, of_grids, "this option is for tensors on a grid; leave it out for a mesh")
+        if args.boundary not in (None, *MESH_BOUNDARIES):
+            raise ValueError(f"--boundary: got {args.boundary!r}; expected {', '.join(MESH_BOUNDARIES)} for a mesh")
+        around = Reading.of(args, file=args.tensors, others=()) if args.tensors else None
+        return cls(file, args.clean, args.inside, args.array, args.order, around)
 
 
-def domain_of(args: argparse.Namespace, progress: Progress) -> Domain:
-    """Read the mesh, and the tensors that give it a metric, from the options; raise ValueError for other options."""
-    _check_options(args)
-    return domain_in(args.file, args.metric, args, progress)
-
-
-def domain_in(file: Path, metric: MetricChoice | None, args: argparse.Namespace, progress: Progress) -> Domain:
-    """Read a mesh, and the tensors that give it the chosen metric, from the options."""
-    with progress.stage("reading", str(file)):
-        return _read_domain(
-            file,
-            _volume_around(args, progress),
-            progress,
-            dtype=args.dtype,
-            clean=args.clean,
-            inside=args.inside,
-            array=args.array,
-            order=args.order,
-            metric=metric,
-            operator=args.operator,
-            interpolation=args.interpolation,
+def require_mesh_options(args: argparse.Namespace) -> None:
+    """Raise ValueError for several files, and for options of tensors without tensors or without --metric."""
+    if args.others:
+        raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one mesh")
+    if not (args.array or args.tensors):
+        why = "this option needs tensors, but without --array and --tensors a mesh has the Euclidean metric"
+        refuse(args, OF_TENSORS, f"{why}. Pass --array or --tensors, or leave this option out")
+        refuse(args, ("noise",), NO_NOISE)
+    elif args.metric is None and args.operator != "fick":
+        raise ValueError(
+            "--metric: the tensors of the mesh need a metric. Choose inverse, tensor or adjugate, or pass "
+            "--operator fick"
         )
+    require_one(args.metric, args.operator)
 
 
-def _volume_around(args: argparse.Namespace, progress: Progress) -> TensorVolume | None:
-    """Read the volume of ``--tensors``, if this option is given."""
-    if not args.tensors:
-        return None
-    if args.array:
-        raise ValueError("--tensors, --array: got both; expected tensors either in a volume or in the mesh's file")
-    volume = read(argparse.Namespace(**vars(args) | {"file": args.tensors, "others": []}), progress)
-    require_valid(volume, "--repair")
-    return volume
-
-
-def solve_mesh(mesh: Mesh, settings: Settings, progress: Progress) -> tuple[Eigenpairs, Settings]:
-    """Compute the eigenpairs of a mesh; return them, and the settings with the boundary condition."""
-    settings = replace(settings, boundary=settings.boundary or "neumann")
-    assert settings.boundary is not None
-    with progress.stage("assembly", f"{len(mesh.vertices)} vertices"):
-        pencil = assemble(mesh, settings.boundary)
-    return solve(pencil, settings, progress), settings
-
-
-def images_of_mesh(file: Path, mesh: Mesh, clean: bool) -> tuple[tuple[str, ...], dict[str, str]]:
+def _images(file: Path, mesh: Mesh, clean: bool) -> tuple[tuple[str, ...], dict[str, str]]:
     """Return the suffixes of results on a mesh, and entries for their provenance.
 
     The suffixes are that of the mesh's file, or .vtu if its format has no values at vertices; and for a GIFTI or a
@@ -110,101 +82,90 @@ def images_of_mesh(file: Path, mesh: Mesh, clean: bool) -> tuple[tuple[str, ...]
     return ((own, MAPS), structure_of(file)) if is_surface(file) and not clean else ((own,), {})
 
 
-def _check_options(args: argparse.Namespace) -> None:
-    """Raise ValueError for options that only grids have, and for tensors without --metric."""
-    if args.others:
-        raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one mesh")
-    of_grids = ["slice", "through", "view", "save_pairs", "components", "method"]
-    if not args.tensors:  # with --tensors, the options for reading refer to the volume
-        of_grids += [o.name for o in options_in(READING) if o.name not in (*OF_TENSORS, "array")]
-    refuse(args, of_grids, "this option is for tensors on a grid; leave it out for a mesh")
-    check_boundary(args.boundary)
-    if not (args.array or args.tensors):
-        why = "this option needs tensors, but without --array and --tensors a mesh has the Euclidean metric"
-        refuse(args, OF_TENSORS, f"{why}. Pass --array or --tensors, or leave this option out")
-        refuse(args, ("noise",), NO_NOISE)
-    elif args.metric is None and args.operator != "fick":
-        raise ValueError(
-            "--metric: the tensors of the mesh need a metric. Choose inverse, tensor or adjugate, or pass "
-            "--operator fick"
-        )
-    require_one(args)
-
-
-def check_boundary(boundary: BoundarySpec | None) -> None:
-    """Raise ValueError for a boundary condition that meshes do not have."""
-    if boundary not in (None, *MESH_BOUNDARIES):
-        raise ValueError(f"--boundary: got {boundary!r}; expected {', '.join(MESH_BOUNDARIES)} for a mesh")
-
-
-def _read_domain(
-    file: Path,
-    volume: TensorVolume | None,
-    progress: Progress,
-    *,
-    dtype: Literal["float32", "float64"],
-    clean: bool,
-    inside: Path | None,
-    array: str | None,
-    order: Order | None,
-    metric: MetricChoice | None,
-    operator: OperatorChoice,
-    interpolation: Interpolation,
-) -> Domain:
+def read_domain(mesh_file: MeshFile, settings: Settings, progress: Progress) -> OfMesh:
     """Read a mesh in the chosen precision, with the metric of tensors in a volume or in an array of its file, if any.
 
-    Without tensors, the mesh has the Euclidean metric. The arguments have the names of the options, except for the
-    volume of ``--tensors``.
+    Without tensors, the mesh has the Euclidean metric.
     """
-    use_dtype(dtype)
-    mesh = read_mesh(file, clean=clean, in_space=volume is not None)
+    with progress.stage("reading", str(mesh_file.file)):
+        volume = None if mesh_file.around is None else read(mesh_file.around, progress)
+        if volume is not None:
+            require_valid(volume, "--repair")
+        use_dtype(settings.dtype)
+        return _with_metric(mesh_file, volume, settings, progress)
+
+
+def _with_metric(mesh_file: MeshFile, volume: TensorVolume | None, settings: Settings, progress: Progress) -> OfMesh:
+    file, dtype = mesh_file.file, settings.dtype
+    mesh = read_mesh(file, clean=mesh_file.clean, in_space=volume is not None)
     vertices, cells = np.asarray(mesh.vertices).astype(dtype), mesh.triangulation.cells
     kind: Any = type(mesh)
-    mask = None if inside is None else _inside(inside, len(vertices))
+    mask = None if mesh_file.inside is None else _inside(mesh_file.inside, len(vertices))
     if mask is not None:
         try:
             kind(vertices, cells, mask=mask)
         except ValueError as error:
             raise ValueError(f"--inside: {str(error).removeprefix('mask: ')}") from error
 
-    def domain(tensors: Any, at: str = "vertices") -> Mesh:
-        settings: Any = {"at": at, "interpolation": interpolation, "mask": mask}
-        made: Mesh = kind.from_tensors(vertices, cells, tensors, metric, operator=operator, **settings)
-        return made
+    def of_tensors(tensors: Any, at: str = "vertices") -> Mesh:
+        how: Any = {"at": at, "operator": settings.operator, "interpolation": settings.interpolation, "mask": mask}
+        with_metric: Mesh = kind.from_tensors(vertices, cells, tensors, settings.metric, **how)
+        return with_metric
+
+    def made(mesh: Mesh, *tensors: Any) -> OfMesh:
+        images, origin = _images(file, mesh, mesh_file.clean)
+        return Domain(mesh, mesh, {"source": str(file), **describe_mesh(file, mesh)}, images, origin, *tensors)
 
     if volume is not None:
         at = np.arange(len(vertices)) if mask is None else np.flatnonzero(mask)
 
         def sampled(values: Any) -> Mesh:
             tensors = np.zeros((len(vertices), 3, 3), dtype)
-            tensors[at] = sample_tensors(replace(volume, tensors=np.asarray(values)), np.asarray(mesh.vertices)[at])
-            return domain(tensors)
+            around = replace(volume, tensors=np.asarray(values))
+            try:
+                tensors[at] = sample_tensors(around, np.asarray(mesh.vertices)[at])
+            except OutsideMaskError as error:
+                remedy = (
+                    "Pass a larger --mask, or pass --inside with the vertices inside the mask, to leave the others out"
+                )
+                raise ValueError(f"{error.fact}. {remedy}") from error
+            return of_tensors(tensors)
 
-        return Domain(sampled(volume.tensors), volume.tensors, volume, sampled)
-    arrays = arrays_by_place(file, clean)
-    if not array:
-        for each in (each for each in listed(arrays) if each["components"] in (6, 9)):
-            progress.note(
-                f"the {each['components']} components of {each['name']} at the {each['at']} are not used, and the mesh "
-                f"has the Euclidean metric. To use them, pass --array {each['name']}"
-                + " and --order"
-                * (each["components"] == 6)
-            )
-        return Domain(kind(vertices, cells, mask=mask), None, None, None)
-    places = [at for at, there in arrays.items() if array in there]
+        return made(sampled(volume.tensors), volume.tensors, sampled, volume)
+    arrays = arrays_by_place(file, mesh_file.clean)
+    if mesh_file.array is None:
+        _tell_of_tensors(arrays, progress)
+        return made(kind(vertices, cells, mask=mask))
+    tensors, place = _tensors_in(arrays, mesh_file.array, mesh_file.order, progress)
+    return made(of_tensors(tensors.astype(dtype), place), tensors.astype(dtype), partial(of_tensors, at=place))
+
+
+def _tell_of_tensors(arrays: Mapping[str, Mapping[str, np.ndarray]], progress: Progress) -> None:
+    """Print a note about arrays that may be tensors."""
+    for each in (each for each in listed(arrays) if each["components"] in (6, 9)):
+        progress.note(
+            f"the {each['components']} components of {each['name']} at the {each['at']} are not used, and the mesh "
+            f"has the Euclidean metric. To use them, pass --array {each['name']}"
+            + " and --order"
+            * (each["components"] == 6)
+        )
+
+
+def _tensors_in(
+    arrays: Mapping[str, Mapping[str, np.ndarray]], name: str, order: Order | None, progress: Progress
+) -> tuple[np.ndarray, str]:
+    """Return the tensors in an array of a mesh, and their place, vertices or cells."""
+    places = [at for at, there in arrays.items() if name in there]
     if not places:
         there = "; ".join(f"at the {at}: {', '.join(named) or 'none'}" for at, named in arrays.items())
-        raise ValueError(f"--array: got {array!r}; expected one of the arrays {there}")
+        raise ValueError(f"--array: got {name!r}; expected one of the arrays {there}")
     if len(places) > 1:
-        progress.note(f"--array: {array} is at the {' and at the '.join(places)}; the {places[0]} are used")
-    values = arrays[places[0]][array]
+        progress.note(f"--array: {name} is at the {' and at the '.join(places)}; the {places[0]} are used")
+    values = arrays[places[0]][name]
     values = values.reshape(len(values), -1)
     if values.shape[1] != (9 if order is None else 6):
-        n = values.shape[1]
-        raise ValueError(f"--array: got {array!r} with {n} components; expected 9, or 6 with --order")
-    tensors = matrices(array, values, order).tensors.astype(dtype)
-    of_tensors = partial(domain, at=places[0])
-    return Domain(of_tensors(tensors), tensors, None, of_tensors)
+        raise ValueError(f"--array: got {name!r} with {values.shape[1]} components; expected 9, or 6 with --order")
+    return matrices(name, values, order).tensors, places[0]
 
 
 def _inside(path: Path, n_vertices: int) -> Bool[np.ndarray, " V"]:

@@ -27,50 +27,49 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from hks_jax import Eigenpairs, ModeEnergies, energy, reconstruct
-from hks_jax.cli import pairs as saved_pairs
-from hks_jax.cli.computation import Settings, compute_pairs, describe_input, describe_pairs
-from hks_jax.cli.info import describe_mesh
-from hks_jax.cli.meshes import OF_MESHES, domain_of, images_of_mesh, solve_mesh
-from hks_jax.cli.options import READING, SOLVING, options_in, refuse
+from hks_jax import ModeEnergies, energy, reconstruct
+from hks_jax.cli import options
+from hks_jax.cli.computation import OfMesh, OfVolume, compute_pairs, describe_pairs
 from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import read_volume, require_metric
+from hks_jax.cli.source import read_source
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.io import TensorVolume, read_maps, save
 from hks_jax.io.cortex import MAPS
-from hks_jax.io.formats import WRITTEN, format_of
+from hks_jax.io.formats import WRITTEN
 from hks_jax.io.mesh import WRITTEN as MESHES_WRITTEN
-from hks_jax.io.mesh import is_mesh, is_surface
+from hks_jax.io.mesh import is_surface
 from hks_jax.io.tables import write_json, write_table
 from hks_jax.signatures.modes import lengths_of
 
-OPTIONS = f"""
-@file @metric {READING} @output {SOLVING}
-{OF_MESHES}
---map FILE
-    a map or a series of maps (4D): NIfTI, MRtrix, NRRD or .npy on the voxels of FILE; for a mesh GIFTI, FreeSurfer's
-    maps (lh.thickness, lh.curv, …), .npy, or a mesh with arrays, one value per vertex. NaN marks unmeasured voxels or
-    vertices: the modes are fitted to the others by least squares. Zeros are values. Values outside the mask are not
-    used
-@view
-"""
+USAGE = "FILE -o OUT"
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    options.add_file(parser)
+    options.add_metric(parser)
+    options.add_reading(parser)
+    options.add_output(parser)
+    options.add_solving(parser)
+    options.add_meshes(parser)
+    parser.add_argument(
+        "--map",
+        type=Path,
+        metavar="FILE",
+        help="a map or a series of maps (4D): NIfTI, MRtrix, NRRD or .npy on the voxels of FILE; for a mesh GIFTI, "
+        "FreeSurfer's maps (lh.thickness, lh.curv, …), .npy, or a mesh with arrays, one value per vertex. NaN marks "
+        "unmeasured voxels or vertices: the modes are fitted to the others by least squares. Zeros are values. Values "
+        "outside the mask are not used",
+    )
+    options.add_view(parser)
+
 
 TABLES = ("modes.tsv", "modes.json", "coefficients.tsv", "energies.tsv")
-
-
-class _Solved(NamedTuple):
-    place: TensorVolume | SimplicialMesh
-    pairs: Eigenpairs
-    settings: Settings
-    images: tuple[str, ...]  # the suffixes of images
-    origin: dict[str, str]  # entries of their provenance
-    unit: str  # of lengths; empty if it is not known
-    about: dict[str, Any]  # the entries of the report about the input
 
 
 def writes(args: argparse.Namespace) -> list[Path]:
@@ -81,8 +80,10 @@ def writes(args: argparse.Namespace) -> list[Path]:
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
-    solved = _on_mesh(args, progress) if is_mesh(args.file) else _on_grid(args, progress)
-    place, pairs, maps = solved.place, solved.pairs, None
+    domain, settings, saved = read_source(args, progress, "neumann")
+    solved = saved or compute_pairs(domain, settings, progress)
+    place, pairs, maps = domain.place, solved.pairs, None
+    unit = place.length_unit if isinstance(place, TensorVolume) else "mm" * is_surface(args.file)
     if pairs.part is not None:
         odd = int((np.asarray(pairs.part) > 0).sum())
         progress.note(
@@ -106,51 +107,27 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
                 shown[title] = np.asarray(reconstruct(pairs, coefficients[0, :n]))
             shown[args.map.name] = np.where(np.isfinite(functions[0]), maps[0], np.nan)
     report = {
-        "input": solved.about,
+        "input": domain.about,
         "settings": {name: asdict(solved.settings)[name] for name in _SETTINGS} | {"k": pairs.k},
         "eigenpairs": describe_pairs(pairs),
-        "units": {"length": solved.unit or None},
+        "units": {"length": unit or None},
         "map": None if maps is None else {"source": str(args.map), "maps": len(maps)},
     }
-    style = {"wavelength": wavelength, "unit": solved.unit, "view": args.view, **means}
+    style = {"wavelength": wavelength, "unit": unit, "view": args.view, **means}
     style |= {"counts": counts, "maps": shown}
     pictures = {"modes.png": partial(_draw, place, functions, style)}
     with writing(args.output, report, progress, lambda: _stale(args), pictures) as (folder, done):
-        _write(folder, "modes", functions, solved, {"eigenvalues": np.asarray(pairs.eigenvalues)})
+        _write(folder, "modes", functions, domain, {"eigenvalues": np.asarray(pairs.eigenvalues)})
         _tabulate(folder / "modes.tsv", known)
-        write_json(folder / "modes.json", _sidecar(solved, known))
+        write_json(folder / "modes.json", _sidecar(domain, unit, known))
         if maps is not None:
-            _write(folder, "reconstruction", projected, solved, {})
+            _write(folder, "reconstruction", projected, domain, {})
             _tabulate(folder / "energies.tsv", known | means)
             _tabulate(folder / "coefficients.tsv", {f"map_{i + 1}": column for i, column in enumerate(coefficients)})
     return done
 
 
 _SETTINGS = ("metric", "operator", "interpolation", "boundary", "components", "solver", "dtype")
-
-
-def _on_grid(args: argparse.Namespace, progress: Progress) -> _Solved:
-    refuse(args, ("clean", "inside"), "this option is for meshes; for tensors on a grid, see --repair and --mask")
-    refuse(args, ("tensors",), "this option is for a mesh inside a volume; leave it out for the volume itself")
-    settings = Settings.of(args, boundary=args.boundary or "neumann")
-    if not args.others and saved_pairs.is_saved_pairs(args.file):
-        settled = [option.name for option in options_in(f"@metric {READING} {SOLVING}")]
-        refuse(args, settled, f"the eigenpairs in {args.file} determine this setting; leave the option out")
-        solved, image = saved_pairs.read_pairs(args.file, settings, progress)
-    else:
-        require_metric(args)
-        volume, image = read_volume(args, progress), format_of(args.file).image
-        solved = compute_pairs(volume, settings, progress)
-    volume = solved.volume
-    return _Solved(volume, solved.pairs, solved.settings, (image,), {}, volume.length_unit, describe_input(volume))
-
-
-def _on_mesh(args: argparse.Namespace, progress: Progress) -> _Solved:
-    mesh = domain_of(args, progress).mesh
-    pairs, settings = solve_mesh(mesh, Settings.of(args, metric=args.metric), progress)
-    about = {"source": str(args.file), **describe_mesh(args.file, mesh)}
-    images, origin = images_of_mesh(args.file, mesh, args.clean)
-    return _Solved(mesh, pairs, settings, images, origin, "mm" * is_surface(args.file), about)
 
 
 def _means(found: ModeEnergies) -> dict[str, np.ndarray]:
@@ -172,7 +149,7 @@ def _tabulate(path: Path, columns: Mapping[str, np.ndarray]) -> None:
     write_table(path, ["mode", *columns], [[i + 1, *row] for i, row in enumerate(rows)])
 
 
-def _sidecar(solved: _Solved, known: Mapping[str, np.ndarray]) -> dict[str, Any]:
+def _sidecar(domain: OfVolume | OfMesh, unit: str, known: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """Return the sidecar of the modes; an infinite length, of the eigenvalue 0, becomes null."""
     lengths = {name: [x if np.isfinite(x) else None for x in known[name].tolist()] for name in ("wavelength", "fwhm")}
     return {
@@ -181,17 +158,18 @@ def _sidecar(solved: _Solved, known: Mapping[str, np.ndarray]) -> dict[str, Any]
         "Eigenvalues": known["eigenvalue"].tolist(),
         "Wavelengths": lengths["wavelength"],
         "FWHM": lengths["fwhm"],
-        "LengthUnits": solved.unit or "of the coordinates",
-        "Sources": [Path(solved.about["source"]).name] if solved.about.get("source") else [],
+        "LengthUnits": unit or "of the coordinates",
+        "Sources": [Path(domain.about["source"]).name] if domain.about.get("source") else [],
     }
 
 
-def _write(folder: Path, name: str, values: np.ndarray, solved: _Solved, extra: Mapping[str, Any]) -> None:
+def _write(folder: Path, name: str, values: np.ndarray, domain: OfVolume | OfMesh, extra: Mapping[str, Any]) -> None:
     """Write modes or maps (m, *shape) as .npz and as images."""
-    save(folder / f"{name}.npz", values, solved.place, name=name, extra=extra)
-    for suffix in filter(None, solved.images):
-        settings: dict[str, Any] = {"extra": {} if suffix.startswith(".nii") else extra, "provenance": solved.origin}
-        save(folder / f"{name}{suffix}", values.astype(np.float32), solved.place, name=name, **settings)
+    save(folder / f"{name}.npz", values, domain.place, name=name, extra=extra)
+    for suffix in filter(None, domain.images):
+        also = {} if suffix.startswith(".nii") else extra
+        stored = values.astype(np.float32)
+        save(folder / f"{name}{suffix}", stored, domain.place, name=name, extra=also, provenance=domain.origin)
 
 
 def _stale(args: argparse.Namespace) -> Iterable[Path]:

@@ -2,10 +2,7 @@
 
 import argparse
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -14,11 +11,10 @@ import numpy as np
 
 import hks_jax as hj
 from hks_jax.checks import require_count
-from hks_jax.cli.computation import Settings, Solved, automatic_times, describe_input, result_of
+from hks_jax.cli.computation import OfMesh, OfVolume, Solved, automatic_times, result_of
 from hks_jax.cli.parsing import Times
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import read_volume
-from hks_jax.io import TensorVolume
+from hks_jax.cli.reading import Reading, read_volume
 from hks_jax.io.result import Result
 from hks_jax.io.volume import require_position
 from hks_jax.signatures.times import FREE
@@ -34,13 +30,12 @@ _CLEAR = 2.0
 """The report contains the first time with a signal-to-noise ratio above this value."""
 
 
-class Noisy(NamedTuple):
-    """Tensors, their noise, a function from tensors to a domain, and whether JAX can trace the function."""
+class Noise(NamedTuple):
+    """The noise of tensors, its source as in ``--noise``, and the number of noisy maps."""
 
-    tensors: np.ndarray
-    noise: hj.TensorNoise
-    domain: Callable[[Any], Any]
-    traceable: bool = True
+    of_tensors: hj.TensorNoise
+    source: str
+    draws: int
 
 
 def check_noise(args: argparse.Namespace) -> None:
@@ -51,44 +46,19 @@ def check_noise(args: argparse.Namespace) -> None:
             raise ValueError(f"--noise: got --method {args.method}; expected spectral. Leave one of the options out")
 
 
-def second_scan(args: argparse.Namespace) -> argparse.Namespace | None:
-    """Return the arguments for reading a second scan if ``--noise`` names a file, or else None."""
-    if args.noise in (None, "residuals", "roughness"):
-        return None
-    try:
-        float(args.noise)
-        return None
-    except ValueError:
-        return argparse.Namespace(**{**vars(args), "file": Path(args.noise), "others": [], "noise": None})
-
-
-def signature_of(args: argparse.Namespace, solved: Solved, noise: hj.TensorNoise | None, progress: Progress) -> Result:
-    """Compute the signature of a volume or slice from its eigenpairs, with error bars unless `noise` is None."""
-    volume, field, pairs, settings = solved
-    of_pairs = partial(result_of, volume, describe_input(volume), pairs)
+def signature_of(solved: Solved, noise: Noise | None, progress: Progress) -> Result:
+    """Compute the signature of a domain from its eigenpairs, with error bars unless `noise` is None."""
     if noise is None:
-        return of_pairs(settings, progress)
-
-    noisy = Noisy(volume.tensors, noise, partial(settings.field, field.grid))
-    return with_error_bars(args, of_pairs, noisy, pairs, settings, progress)
-
-
-def with_error_bars(
-    args: argparse.Namespace,
-    of_pairs: Callable[[Settings, Progress], Result],
-    noisy: Noisy,
-    pairs: hj.Eigenpairs,
-    settings: Settings,
-    progress: Progress,
-) -> Result:
-    """Compute a signature by `of_pairs`, and its error bars."""
-    bars, maps, interior, times = _error_bars(args, noisy, pairs, settings, progress)
-    result = of_pairs(replace(settings, times=Times(times, settings.times.automatic)), progress)
+        return result_of(solved, progress)
+    settings = solved.settings
+    bars, maps, interior, times = _error_bars(solved, noise, progress)
+    chosen = replace(settings, times=Times(times, settings.times.automatic))
+    result = result_of(solved._replace(settings=chosen), progress)
     ratio = np.asarray(bars.signal_to_noise_at(interior))
     nodes = np.isfinite(np.asarray(bars.value[0])).sum()
     clear = np.flatnonzero(ratio > _CLEAR)
     report = {
-        "source": args.noise,
+        "source": noise.source,
         "draws": bars.draws,
         "sampling_error": bars.sampling_error,
         "indefinite": float(bars.indefinite),
@@ -123,32 +93,43 @@ def _told(ratio: np.ndarray, times: tuple[float, ...], unit: str) -> list[str]:
     return lines
 
 
-def noise_of_volume(
-    args: argparse.Namespace, volume: TensorVolume, grid: hj.Grid, progress: Progress
-) -> hj.TensorNoise | None:
-    """Return the noise of a volume's tensors according to ``--noise``, or None without this option."""
-    if args.noise is None:
+def noise_of(domain: OfVolume | OfMesh, reading: Reading, draws: int, progress: Progress) -> Noise | None:
+    """Return the noise of a domain's tensors according to ``--noise``, or None without this option."""
+    source, volume = reading.noise, domain.volume
+    if source is None:
         return None
-    if args.noise == "residuals":
+    if volume is None:
+        assert domain.tensors is not None
+        try:
+            level = float(source)
+        except ValueError:
+            raise ValueError(
+                f"--noise: got {source!r}; expected a number, relative to the mean diffusivity, for tensors of a mesh"
+            ) from None
+        return Noise(hj.TensorNoise.relative(domain.tensors, level), source, draws)
+    grid = volume.grid("all")
+    if source == "residuals":
         if volume.covariance is None:
             raise ValueError("--noise: got residuals, which need a fit to diffusion-weighted images (--bval, --bvec)")
-        return volume.noise(grid)
-    if args.noise == "roughness":
-        return hj.TensorNoise.from_roughness(volume.tensors, grid)
-    if (second := second_scan(args)) is not None:
+        noise = volume.noise(grid)
+    elif source == "roughness":
+        noise = hj.TensorNoise.from_roughness(volume.tensors, grid)
+    elif (second := reading.second_scan) is not None:
         other = read_volume(second, progress)
-        require_position(args.noise, other.affine, volume.affine, volume.volume_shape)
+        require_position(source, other.affine, volume.affine, volume.volume_shape)
         if other.shape == grid.shape and (lacking := int((grid.inside & ~other.inside).sum())):
             raise ValueError(
-                f"--noise: got {args.noise} without tensors at {lacking} of the {int(grid.inside.sum())} voxels of the "
+                f"--noise: got {source} without tensors at {lacking} of the {int(grid.inside.sum())} voxels of the "
                 "domain; expected tensors of both scans. Pass --mask with the voxels that both scans cover"
             )
-        return hj.TensorNoise.from_scans(volume.tensors, other.tensors, grid)
-    return hj.TensorNoise.relative(volume.tensors, float(args.noise), grid)
+        noise = hj.TensorNoise.from_scans(volume.tensors, other.tensors, grid)
+    else:
+        noise = hj.TensorNoise.relative(volume.tensors, float(source), grid)
+    return Noise(noise, source, draws)
 
 
 def _error_bars(
-    args: argparse.Namespace, noisy: Noisy, pairs: hj.Eigenpairs, settings: Settings, progress: Progress
+    solved: Solved, noise: Noise, progress: Progress
 ) -> tuple[hj.Uncertainty, np.ndarray, np.ndarray, tuple[float, ...]]:
     """Return error bars, the sampled noise (n_draws, n_times, *shape), the interior (n_times, *shape), and the times.
 
@@ -156,20 +137,25 @@ def _error_bars(
     it is empty at times with few such nodes. For other boundary conditions, the interior is the whole domain.
     Automatic times begin at the first time with a sufficient signal-to-noise ratio.
     """
-    wanted = settings.times.automatic
+    domain, pairs, settings = solved
+    assert domain.tensors is not None
+    assert domain.of_tensors is not None
+    of_tensors, wanted = domain.of_tensors, settings.times.automatic
     times = settings.times.explicit or automatic_times(pairs, _CANDIDATES * wanted)
     maps: list[np.ndarray] = []
 
     def signature(D: Any) -> Any:
         assert settings.boundary is not None
-        domain = noisy.domain(D)
-        return hj.hks(hj.eigenpairs(domain, pairs.k, settings.boundary, settings.solver), times, settings.normalisation)
+        field = of_tensors(D)
+        return hj.hks(hj.eigenpairs(field, pairs.k, settings.boundary, settings.solver), times, settings.normalisation)
 
-    with progress.stage("error bars", f"{args.draws} noisy maps"), warnings.catch_warnings():
+    with progress.stage("error bars", f"{noise.draws} noisy maps"), warnings.catch_warnings():
         warnings.simplefilter("ignore", hj.AccuracyWarning)  # some warnings concern candidate times that are not chosen
-        tensors, more = noisy.tensors.astype(settings.dtype), {"draws": args.draws, "compiled": noisy.traceable}
+        tensors = domain.tensors.astype(settings.dtype)
+        in_volume = domain.volume is not None and domain.volume is not domain.place  # JAX cannot trace the sampling
+        more: dict[str, Any] = {"draws": noise.draws, "compiled": not in_volume}
         more |= {"each": lambda one: maps.append(np.asarray(one, np.float32)), "progress": progress.update}
-        bars = hj.uncertainty(signature, tensors, noisy.noise, method="resample", **more)
+        bars = hj.uncertainty(signature, tensors, noise.of_tensors, method="resample", **more)
         interior = np.isfinite(np.asarray(bars.value))
         if len(pairs.pencil.parts) == 2:
             nodes = interior[0].sum()

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from hks_jax import assemble
-from hks_jax.cli.computation import Settings, Solved, field_of
+from hks_jax.cli.computation import Settings, Solved, domain_of_volume
 from hks_jax.cli.progress import Progress
 from hks_jax.io.arrays import place_of, volume_of
 from hks_jax.io.pairs import pairs_of, save_pairs
@@ -37,14 +37,15 @@ def is_saved_pairs(path: Path) -> bool:
     return _RECORD in arrays_in(path)
 
 
-def write_pairs(path: Path, solved: Solved, image: str, warnings: Sequence[str], fingerprint: str = "") -> None:
+def write_pairs(path: Path, solved: Solved, warnings: Sequence[str], fingerprint: str = "") -> None:
     """Write eigenpairs with the volume, whose mask is the domain, and with the settings of their computation.
 
     The file also contains the suffix of image files (such as .nii.gz), the warnings, and the fingerprint of a subject.
     """
-    volume, settings = solved.volume, asdict(solved.settings)
+    volume, settings = solved.domain.volume, asdict(solved.settings)
+    assert volume is not None
     record = {name: getattr(volume, name) for name in _ABOUT}
-    record |= {"image": image, "warnings": warnings, "fingerprint": fingerprint}
+    record |= {"image": solved.domain.images[0], "warnings": warnings, "fingerprint": fingerprint}
     record["settings"] = {name: settings[name] for name in settings if name in _SETTLED}
     save_pairs(path, solved.pairs, {"tensors": volume.tensors, **place_of(volume), _RECORD: json.dumps(plain(record))})
 
@@ -57,8 +58,8 @@ def are_of(path: Path, fingerprint: str) -> bool:
         return bool(json.loads(str(arrays[_RECORD]))["fingerprint"] == fingerprint)
 
 
-def read_pairs(path: Path, settings: Settings, progress: Progress) -> tuple[Solved, str]:
-    """Return saved eigenpairs and the suffix of image files; settings in the file replace settings in `settings`."""
+def read_pairs(path: Path, settings: Settings, progress: Progress) -> Solved:
+    """Return saved eigenpairs; settings in the file replace settings in `settings`."""
     arrays = load_npz(path)
     record: dict[str, Any] = json.loads(str(arrays[_RECORD]))
     about = {name: record[name] for name in _ABOUT if name in record} | {"notes": tuple(record["notes"])}
@@ -68,6 +69,6 @@ def read_pairs(path: Path, settings: Settings, progress: Progress) -> tuple[Solv
     for warning in record["warnings"]:
         progress.warn(warning)
     with progress.stage("assembly"):
-        field = field_of(volume, volume.grid("all"), settings)
-        pairs = pairs_of(str(path), arrays, assemble(field, boundary))
-    return Solved(volume, field, pairs, settings), record["image"]
+        domain = domain_of_volume(volume, settings, record["image"])
+        pairs = pairs_of(str(path), arrays, assemble(domain.field, boundary))
+    return Solved(domain, pairs, settings)

@@ -15,33 +15,78 @@ from typing import Any
 
 import numpy as np
 
+from hks_jax.cli import options
 from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import Done
-from hks_jax.cli.parsing import parse_times
+from hks_jax.cli.parsing import axis_and_index, colour_range, file_in_folder, parse_times, point, quantiles
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import sliced
 from hks_jax.io.result import Result
 
-OPTIONS = """
-result RESULT  the result, as an .npz or the folder of a signature
--o,--output PICTURE!  the picture: .png, .pdf, .svg, …
---array NAME  name of the array in the file (default: hks or curvature)
---times T...  some of the saved times, or auto:N for N evenly spaced ones (default: all times, at most 12)
---slice AXIS=N  slice of a volume, such as z=14 (default: the middle along z)
---points X,Y...  draw curves at these coordinates, as the images show them, instead of images
---range R = own
-    range of the colours: own for each image (default) or shared by all images, at least 1 % of the values; or two
-    numbers LOW,HIGH (write --range=LOW,HIGH if LOW is negative)
---quantiles Q,Q
-    quantiles of the values at the two ends of an own or shared range of colours (default: 0.002,0.998 of a signature's
-    values free of the boundary, as 'hks-jax hks' draws them; 0,1 of other arrays)
---cmap NAME  colour map of matplotlib (default: viridis, or colours that diverge from 1 if 1 means flat space)
---scaled  draw (4πt)^(d/2)·HKS, which is 1 for flat space (with --normalisation flat, this is always drawn)
---unit-of-t TEXT  unit of t, if the result does not have it (default: that of the result)
---title TEXT  title of the picture
---dpi DPI = 150  pixels per inch
-@view @rim
-"""
+USAGE = "RESULT -o PICTURE"
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    parser.add_argument(
+        "result", type=Path, metavar="RESULT", help="the result, as an .npz or the folder of a signature"
+    )
+    parser.add_argument(
+        "-o", "--output", type=file_in_folder, required=True, metavar="PICTURE", help="the picture: .png, .pdf, .svg, …"
+    )
+    parser.add_argument("--array", metavar="NAME", help="name of the array in the file (default: hks or curvature)")
+    parser.add_argument(
+        "--times",
+        nargs="+",
+        metavar="T",
+        help="some of the saved times, or auto:N for N evenly spaced ones (default: all times, at most 12)",
+    )
+    parser.add_argument(
+        "--slice",
+        type=axis_and_index,
+        metavar="AXIS=N",
+        help="slice of a volume, such as z=14 (default: the middle along z)",
+    )
+    parser.add_argument(
+        "--points",
+        nargs="+",
+        type=point,
+        metavar="X,Y",
+        help="draw curves at these coordinates, as the images show them, instead of images",
+    )
+    parser.add_argument(
+        "--range",
+        type=colour_range,
+        default="own",
+        metavar="R",
+        help="range of the colours: own for each image (default) or shared by all images, at least 1 %% of the "
+        "values; or two numbers LOW,HIGH (write --range=LOW,HIGH if LOW is negative)",
+    )
+    parser.add_argument(
+        "--quantiles",
+        type=quantiles,
+        metavar="Q,Q",
+        help="quantiles of the values at the two ends of an own or shared range of colours (default: 0.002,0.998 of a "
+        "signature's values free of the boundary, as 'hks-jax hks' draws them; 0,1 of other arrays)",
+    )
+    parser.add_argument(
+        "--cmap",
+        metavar="NAME",
+        help="colour map of matplotlib (default: viridis, or colours that diverge from 1 if 1 means flat space)",
+    )
+    parser.add_argument(
+        "--scaled",
+        action="store_true",
+        help="draw (4πt)^(d/2)·HKS, which is 1 for flat space (with --normalisation flat, this is always drawn)",
+    )
+    parser.add_argument(
+        "--unit-of-t", metavar="TEXT", help="unit of t, if the result does not have it (default: that of the result)"
+    )
+    parser.add_argument("--title", metavar="TEXT", help="title of the picture")
+    parser.add_argument("--dpi", type=float, default=150.0, metavar="DPI", help="pixels per inch (default 150)")
+    options.add_view(parser)
+    options.add_rim(parser)
+
 
 MANY = 12
 """The largest number of images, unless times are chosen."""

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, TextIO
 
-from hks_jax.cli.options import as_options
+from hks_jax.naming import with_option
 
 WIDTH = 20
 INTERVAL = 5.0
@@ -107,7 +107,7 @@ class Progress:
 
         def show(message: Warning | str, category: type[Warning], *_position: Any, **more: Any) -> None:
             if issubclass(category, UserWarning):
-                self.warn(as_options(str(message)))
+                self.warn(with_option(str(message)))
 
         with warnings.catch_warnings():
             warnings.simplefilter("always", UserWarning)

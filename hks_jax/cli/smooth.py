@@ -22,59 +22,76 @@ examples:
 
 import argparse
 import math
-from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
 
 from hks_jax import SurfaceMesh, TensorField, gaussian_scale_space
-from hks_jax.cli.computation import Settings, describe_input, field_of
-from hks_jax.cli.info import describe_mesh
-from hks_jax.cli.meshes import OF_VERTICES, Domain, check_boundary, domain_in, images_of_mesh
-from hks_jax.cli.options import READING, options_in, refuse
+from hks_jax.cli import options
+from hks_jax.cli.computation import OfMesh, OfVolume, Settings, domain_of_volume
+from hks_jax.cli.meshes import MeshFile, read_domain
+from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import REPORT, Done, writing
+from hks_jax.cli.parsing import boundary_conditions
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import read_volume
-from hks_jax.domain.simplicial_mesh import SimplicialMesh
+from hks_jax.cli.reading import Reading, read_volume
 from hks_jax.fem.boundary import unreached_sides
-from hks_jax.io import TensorVolume, read_maps, save
+from hks_jax.io import read_maps, save
 from hks_jax.io.cortex import MAPS
 from hks_jax.io.formats import WRITTEN, format_of
 from hks_jax.io.mesh import WRITTEN as MESHES_WRITTEN
 from hks_jax.spectrum_free.smoothing import smooth
 
-OPTIONS = f"""
-file FILE...  the maps
---fwhm LENGTH!
-    mean full width at half maximum of the smoothing, in mm, at least the voxel size, or the median edge of a mesh
---tensors FILE  the diffusion tensors; required unless --mesh is given
---mesh FILE
-    the mesh at whose vertices the maps are. With --tensors, the tensors of this volume are interpolated at the vertices
-    in scanner coordinates, as in 'hks-jax hks'; with --array, the mesh's file has them
-{OF_VERTICES}
-{READING} @domain @dtype @interpolation @output
---operator fick|laplace-beltrami = fick
-    fick: the diffusion of a substance by Fick's law (default), whose density becomes uniform in space.
-    laplace-beltrami: the heat flow of the metric D⁻¹, which keeps the integral with the volume of this metric
---boundary CONDITION = neumann
-    condition at the boundary of the domain: neumann (nothing flows through it, the default); dirichlet (the map is 0 at
-    the sides of the image, or at the boundary of a mesh); dirichlet-rim (also at the boundary of a mask); or periodic.
-    Give one condition for all axes, or one per axis
-@view
-"""
+USAGE = "FILE --fwhm LENGTH -o OUT"
 
 
-class _Place(NamedTuple):
-    place: TensorVolume | SimplicialMesh
-    domain: TensorField | SimplicialMesh
-    inside: Bool[np.ndarray, "*shape"]
-    images: tuple[str, ...]  # the suffixes of images
-    origin: dict[str, str]  # entries of their provenance
-    about: dict[str, Any]  # the entries of the report about the input
-    draw: Callable[..., None]
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    parser.add_argument("file", action=options.FirstAndOthers, nargs="+", type=Path, metavar="FILE", help="the maps")
+    parser.add_argument(
+        "--fwhm",
+        type=float,
+        required=True,
+        metavar="LENGTH",
+        help="mean full width at half maximum of the smoothing, in mm, at least the voxel size, or the median edge of "
+        "a mesh",
+    )
+    parser.add_argument(
+        "--tensors", type=Path, metavar="FILE", help="the diffusion tensors; required unless --mesh is given"
+    )
+    parser.add_argument(
+        "--mesh",
+        type=Path,
+        metavar="FILE",
+        help="the mesh at whose vertices the maps are. With --tensors, the tensors of this volume are interpolated at "
+        "the vertices in scanner coordinates, as in 'hks-jax hks'; with --array, the mesh's file has them",
+    )
+    options.add_vertices(parser)
+    options.add_reading(parser)
+    options.add_components(parser)
+    options.add_dtype(parser)
+    options.add_interpolation(parser)
+    options.add_output(parser)
+    parser.add_argument(
+        "--operator",
+        choices=("fick", "laplace-beltrami"),
+        default="fick",
+        help="fick: the diffusion of a substance by Fick's law (default), whose density becomes uniform in space. "
+        "laplace-beltrami: the heat flow of the metric D⁻¹, which keeps the integral with the volume of this metric",
+    )
+    parser.add_argument(
+        "--boundary",
+        type=boundary_conditions,
+        default="neumann",
+        metavar="CONDITION",
+        help="condition at the boundary of the domain: neumann (nothing flows through it, the default); dirichlet "
+        "(the map is 0 at the sides of the image, or at the boundary of a mesh); dirichlet-rim (also at the boundary "
+        "of a mask); or periodic. Give one condition for all axes, or one per axis",
+    )
+    options.add_view(parser)
 
 
 def writes(args: argparse.Namespace) -> list[Path]:
@@ -86,7 +103,9 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
     if args.others:
         raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one file of maps")
-    place, domain, inside, images, origin, about, draw = (_on_grid if args.mesh is None else _on_mesh)(args, progress)
+    domain = _on_grid(args, progress) if args.mesh is None else _on_mesh(args, progress)
+    place, field = domain.place, domain.field
+    inside = field.grid.inside if isinstance(field, TensorField) else field.triangulation.used
     with progress.stage("reading", str(args.file)):
         maps = read_maps(args.file, place)
     where = "voxels" if args.mesh is None else "vertices"
@@ -97,57 +116,51 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
             f"Pass {remedy} without these {where}"
         )
     with progress.stage("smoothing", f"{len(maps)} maps at {int(inside.sum())} {where}"):
-        smoothed = np.asarray(smooth(domain, maps, args.fwhm, args.boundary))
+        smoothed = np.asarray(smooth(field, maps, args.fwhm, args.boundary))
     chosen = ("fwhm", "operator", "interpolation", "boundary", "dtype", "components")
     report = {
-        "input": {**about, "maps": {"source": str(args.file), "number": len(maps)}},
+        "input": {**domain.about, "maps": {"source": str(args.file), "number": len(maps)}},
         "settings": {name: getattr(args, name) for name in chosen},
     }
     stale = [args.output / f"smoothed{suffix}" for suffix in (MAPS, *WRITTEN, *MESHES_WRITTEN)]
-    pictures = {"smoothed.png": partial(draw, args, maps[0], smoothed[0])}
+    draw: Any = _draw if args.mesh is None else _draw_mesh
+    pictures = {"smoothed.png": partial(draw, domain, args, maps[0], smoothed[0])}
+    record = {**report["settings"], **domain.origin}
     with writing(args.output, report, progress, lambda: stale, pictures) as (folder, done):
         values = smoothed if len(smoothed) > 1 else smoothed[0]
-        for suffix in filter(None, (".npz", *images)):
+        for suffix in filter(None, (".npz", *domain.images)):
             stored = values if suffix == ".npz" else values.astype(np.float32)
-            save(folder / f"smoothed{suffix}", stored, place, name="smoothed", provenance=report["settings"] | origin)
+            save(folder / f"smoothed{suffix}", stored, place, name="smoothed", provenance=record)
     return done
 
 
-def _on_grid(args: argparse.Namespace, progress: Progress) -> _Place:
+def _on_grid(args: argparse.Namespace, progress: Progress) -> OfVolume:
     if args.tensors is None:
         raise ValueError(
             "--tensors: got no file; expected the diffusion tensors of the voxels, or the mesh of the maps"
         )
     refuse(args, ("clean", "inside"), "this option is for meshes; for tensors on a grid, see --repair and --mask")
     metric = None if args.operator == "fick" else "inverse"
-    of_tensors = argparse.Namespace(**vars(args) | {"file": args.tensors, "metric": metric})
-    volume = read_volume(of_tensors, progress)
-    field = field_of(volume, volume.grid(args.components), Settings.of(of_tensors, metric=metric))
-    for message in unreached_sides(field.grid.inside, args.boundary):
+    volume = read_volume(Reading.of(args, file=args.tensors, metric=metric), progress)
+    domain = domain_of_volume(volume, Settings.of(args, metric=metric), format_of(args.tensors).image)
+    for message in unreached_sides(domain.field.grid.inside, args.boundary):
         progress.warn(message)
-    volume = volume.with_mask(field.grid.mask)
-    images = (format_of(args.tensors).image,)
-    return _Place(volume, field, field.grid.inside, images, {}, describe_input(volume), partial(_draw, volume))
+    return domain
 
 
-def _on_mesh(args: argparse.Namespace, progress: Progress) -> _Place:
-    of_grids = ["slice", "view", "components"]
-    if args.tensors is None:  # with --tensors, the options for reading refer to the volume
-        of_grids += [o.name for o in options_in(READING) if o.name not in ("order", "array")]
-    refuse(args, of_grids, "this option is for tensors on a grid; leave it out for a mesh")
-    check_boundary(args.boundary)
-    found = domain_in(args.mesh, None if args.operator == "fick" else "inverse", args, progress)
-    mesh = found.mesh
-    (images, origin), about = images_of_mesh(args.mesh, mesh, args.clean), describe_mesh(args.mesh, mesh)
-    about |= {"source": str(args.mesh), "tensors": None if args.tensors is None else str(args.tensors)}
-    return _Place(mesh, mesh, mesh.triangulation.used, images, origin, about, partial(_draw_mesh, found))
+def _on_mesh(args: argparse.Namespace, progress: Progress) -> OfMesh:
+    metric = None if args.operator == "fick" else "inverse"
+    domain = read_domain(MeshFile.of(args, args.mesh), Settings.of(args, metric=metric), progress)
+    about = domain.about | {"tensors": None if args.tensors is None else str(args.tensors)}
+    return replace(domain, about=about)
 
 
-def _draw(volume: TensorVolume, args: argparse.Namespace, before: np.ndarray, after: np.ndarray, path: Path) -> None:
+def _draw(domain: OfVolume, args: argparse.Namespace, before: np.ndarray, after: np.ndarray, path: Path) -> None:
     """Draw the map, the smoothed map, and the map after isotropic smoothing of the same width, in a middle slice."""
     from hks_jax.plot import hks_panels
     from hks_jax.plot.signature import cropped, middle_slice, placed
 
+    volume = domain.place
     field = TensorField(volume.grid("all"), np.broadcast_to(np.eye(volume.dimension), volume.tensors.shape))
     time = args.fwhm**2 / (16 * math.log(2.0))
     inside = field.grid.inside
@@ -161,13 +174,13 @@ def _draw(volume: TensorVolume, args: argparse.Namespace, before: np.ndarray, af
     hks_panels(values[:, *box], [0.0] * 3, grid, titles=_titles(args.fwhm), **style)
 
 
-def _draw_mesh(found: Domain, args: argparse.Namespace, before: np.ndarray, after: np.ndarray, path: Path) -> None:
+def _draw_mesh(domain: OfMesh, args: argparse.Namespace, before: np.ndarray, after: np.ndarray, path: Path) -> None:
     """Draw the map, the smoothed map, and if there are tensors the map after smoothing without them."""
     from hks_jax.plot.images import Colours
     from hks_jax.plot.surfaces import surface_panels
 
-    mesh, shown, titles = found.mesh, [before, after], _titles(args.fwhm)
-    if found.tensors is None:
+    mesh, shown, titles = domain.place, [before, after], _titles(args.fwhm)
+    if domain.tensors is None:
         titles = [titles[0], f"smoothed, {args.fwhm:g} mm"]
     else:
         plain = type(mesh)(mesh.vertices, mesh.triangulation.cells, mask=np.ones(len(mesh.triangulation.cells), bool))

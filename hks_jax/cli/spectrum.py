@@ -22,14 +22,23 @@ from typing import Any
 import numpy as np
 
 from hks_jax import Eigenpairs, TensorField
-from hks_jax.cli.computation import Settings, compute_pairs, describe_input, describe_pairs
-from hks_jax.cli.options import READING, SOLVING
+from hks_jax.cli import options
+from hks_jax.cli.computation import Settings, compute_pairs, describe_pairs, domain_of_volume
 from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import read_volume
+from hks_jax.cli.reading import Reading, read_volume
 from hks_jax.eigen.weyl import weyl_count
 
-OPTIONS = f"@file @metric {READING} @output {SOLVING}"
+USAGE = "FILE -o OUT"
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    options.add_file(parser)
+    options.add_metric(parser)
+    options.add_reading(parser)
+    options.add_output(parser)
+    options.add_solving(parser)
 
 
 def writes(args: argparse.Namespace) -> list[Path]:
@@ -39,25 +48,26 @@ def writes(args: argparse.Namespace) -> list[Path]:
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
-    volume = read_volume(args, progress)
+    volume = read_volume(Reading.of(args), progress)
     settings = Settings.of(args, boundary=args.boundary or "neumann")
-    solved = compute_pairs(volume, settings, progress)
-    field, pairs = solved.field, solved.pairs
+    domain = domain_of_volume(volume, settings)
+    solved = compute_pairs(domain, settings, progress)
+    pairs = solved.pairs
     columns: dict[str, Any] = {
         "eigenvalues": np.asarray(pairs.eigenvalues),
         "residuals": np.asarray(pairs.residuals),
-        "weyl_counts": weyl_count(pairs, pairs.eigenvalues, field),
+        "weyl_counts": weyl_count(pairs, pairs.eigenvalues, domain.field),
     }
     left_out = ("times", "normalisation", "method")
     report = {
-        "input": describe_input(solved.volume),
+        "input": domain.about,
         "settings": {name: value for name, value in asdict(solved.settings).items() if name not in left_out}
         | {"k": pairs.k},
         "eigenpairs": describe_pairs(pairs),
         "volume": np.asarray(pairs.pencil.volume).item(),
         "eigenvalues": columns["eigenvalues"].tolist(),
     }
-    with writing(args.output, report, progress, pictures={"spectrum.png": partial(_draw, pairs, field)}) as (
+    with writing(args.output, report, progress, pictures={"spectrum.png": partial(_draw, pairs, domain.field)}) as (
         folder,
         done,
     ):

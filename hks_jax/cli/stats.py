@@ -20,8 +20,10 @@ from typing import Any
 import numpy as np
 
 from hks_jax import __version__
+from hks_jax.cli import options
 from hks_jax.cli.computation import HALF
 from hks_jax.cli.outputs import Done
+from hks_jax.cli.parsing import file_in_folder
 from hks_jax.cli.progress import Progress
 from hks_jax.io.masks import names_beside, read_labels, read_names
 from hks_jax.io.result import Result, signature_file
@@ -31,12 +33,26 @@ from hks_jax.io.volume import digest
 from hks_jax.signatures.regions import region_statistics
 from hks_jax.signatures.times import FREE
 
-OPTIONS = """
-result RESULT  the folder OUT that 'hks-jax hks' wrote, or an .npz from there
--o,--output TABLE  the table (default: regions.tsv in OUT)
---atlas FILE!  integer labels on the image's voxels, with 0 for unlabelled (NIfTI, MRtrix, NRRD or .npy)
-@names
-"""
+USAGE = "RESULT --atlas FILE"
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    parser.add_argument(
+        "result", type=Path, metavar="RESULT", help="the folder OUT that 'hks-jax hks' wrote, or an .npz from there"
+    )
+    parser.add_argument(
+        "-o", "--output", type=file_in_folder, metavar="TABLE", help="the table (default: regions.tsv in OUT)"
+    )
+    parser.add_argument(
+        "--atlas",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="integer labels on the image's voxels, with 0 for unlabelled (NIfTI, MRtrix, NRRD or .npy)",
+    )
+    options.add_names(parser)
+
 
 _SCALES = {
     "raw": "the heat kernel signature, per (metric length)^d, or per length^d for Fick's operator",

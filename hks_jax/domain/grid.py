@@ -13,6 +13,7 @@ from jaxtyping import Float
 from hks_jax.arrays import ByKey, StaticArray
 from hks_jax.checks import require_real, require_static
 from hks_jax.domain.components import active_elements, as_mask, label_nodes
+from hks_jax.naming import argument
 
 
 @jax.tree_util.register_static
@@ -183,7 +184,8 @@ def _checked_mask(mask: Any, shape: tuple[int, ...], components: str) -> np.ndar
             largest = ", ".join(str(n) for n in np.sort(sizes)[::-1][:5]) + (", …" if count > 5 else "")
             raise ValueError(
                 f"mask: got {count} connected components ({largest} nodes); expected one component. "
-                'Pass components="largest" to keep the largest one, or components="all" to keep all'
+                f"Pass {argument('components', 'largest')} to keep the largest one, or {argument('components', 'all')} "
+                "to keep all"
             )
         array = labels == 1 + int(np.argmax(sizes))
     return array

@@ -13,6 +13,7 @@ from hks_jax.domain.components import active_elements, as_mask, element_nodes, r
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_checks import require_grid
 from hks_jax.domain.tensor_field import TensorField, require_field
+from hks_jax.naming import argument
 
 Sides: TypeAlias = tuple[str, str]
 """The conditions at the low and the high side of one axis."""
@@ -89,7 +90,10 @@ def default_boundary(inside: Bool[np.ndarray, "*shape"]) -> tuple[str, str]:
     free = element_nodes(elements, every_axis) & ~rim_nodes(elements, every_axis)
     if not free[(slice(1, -1),) * inside.ndim].any():  # the mean needs nodes away from sides and rim
         return "neumann", "the mask is so thin that all voxels are on the rim, but the mean needs inner voxels"
-    return "mean", 'the domain has a mask; for the natural condition on its rim, pass boundary="neumann"'
+    return (
+        "mean",
+        f"the domain has a mask; for the natural condition on its rim, pass {argument('boundary', 'neumann')}",
+    )
 
 
 def unreached_sides(inside: Bool[np.ndarray, "*shape"], boundary: BoundarySpec) -> list[str]:

@@ -17,6 +17,7 @@ from hks_jax.io.masks import mask_on
 from hks_jax.io.tensor_order import Matrices, indices, pack, to_voxel_axes, unpack
 from hks_jax.io.units import MM2_PER_S, UNITS, Unit, b_value_question, median_mean_diffusivity
 from hks_jax.io.volume import TensorVolume, digest, placed
+from hks_jax.naming import argument
 from hks_jax.optional import optional
 from hks_jax.storage import existing, reading
 
@@ -193,7 +194,7 @@ def _warn_of_large_b(largest: float, volume: TensorVolume) -> None:
         warn_of_accuracy(
             f"tensors are fitted to images up to b = {largest:g} s/mm², but a tensor describes the signal of tissue "
             f"only for b ≲ {_TENSOR_MODEL:g} s/mm²; at larger b-values, diffusivities are underestimated. If the scan "
-            f"has images at lower b-values, pass b_max={_TENSOR_MODEL:g}"
+            f"has images at lower b-values, pass {argument('b_max', int(_TENSOR_MODEL))}"
         )
 
 

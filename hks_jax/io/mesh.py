@@ -21,6 +21,7 @@ from hks_jax.io.mesh_formats import Loaded, load_obj, load_off, polygonal, throu
 from hks_jax.io.ply import load_ply
 from hks_jax.io.tables import write_json
 from hks_jax.io.vtk_image import holds_dataset
+from hks_jax.naming import argument
 from hks_jax.optional import optional
 from hks_jax.storage import atomic_path, existing
 
@@ -72,7 +73,7 @@ def read_mesh(path: str | os.PathLike[str], *, clean: bool = False, in_space: bo
     """
     loaded, said = _load(path, clean, in_space)
     make: Callable[..., SurfaceMesh | TetMesh] = SurfaceMesh if loaded.cells.shape[1] == 3 else TetMesh
-    remedy = "" if clean else ". clean=True repairs some defects: see read_mesh"
+    remedy = "" if clean else f". {argument('clean', True)} repairs some defects"
     try:
         mesh = make(loaded.vertices, loaded.cells)
         if not clean:

@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.io.plausibility import OPEN_FRAME
+from hks_jax.io.plausibility import undeclared_frame
 from hks_jax.io.repair import require_symmetric
 from hks_jax.io.tables import write_json
 from hks_jax.io.tensor_order import FRAMES, ORDERS, matrices, pack
 from hks_jax.io.units import by_axis
 from hks_jax.io.volume import AXES, Format, TensorVolume, corners, describe_tensors, images_of, own_record, placed
+from hks_jax.naming import argument
 from hks_jax.optional import optional
 from hks_jax.storage import atomic_path, content_of, existing, reading
 
@@ -137,7 +138,8 @@ def read_tensors(name: str, order: str | None, frame: str | None, image: Any = N
     if shape[3:] not in ((6,), (1, 6)):
         remedy = "Fit tensors to diffusion-weighted images first by hks_jax.io.fit_dwi, or by --bval and --bvec"
         if shape[3:] == (8,):
-            remedy += '. Camino writes an exit code and log S₀ before the tensor: remove both, and pass order "fsl"'
+            remedy += ". Camino writes an exit code and log S₀ before the tensor: remove both, and pass "
+            remedy += argument("order", "fsl")
         raise ValueError(
             f"{name}: got an image of shape {shape}; expected six components per voxel, (nx, ny, nz, 1, 6) or "
             f"(nx, ny, nz, 6). {remedy}"
@@ -170,7 +172,7 @@ def read_tensors(name: str, order: str | None, frame: str | None, image: Any = N
     if np.abs(header / stored - 1).max() > 1e-3:
         notes.append(f"voxel sizes {by_axis(stored)} taken from the affine; the header's pixdim says {by_axis(header)}")
     if open_frame and np.linalg.det(affine[:3, :3]) > 0:
-        notes.append(OPEN_FRAME)
+        notes.append(undeclared_frame())
     return replace(volume, notes=(*notes, *volume.notes))
 
 

@@ -14,6 +14,7 @@ from hks_jax.io.repair import require_symmetric
 from hks_jax.io.tensor_order import matrices, nearest_rotation, pack, to_voxel_axes
 from hks_jax.io.units import millimetres
 from hks_jax.io.volume import Format, TensorVolume, describe_tensors, images_of, own_record, shear_notes
+from hks_jax.naming import argument
 from hks_jax.optional import optional
 from hks_jax.storage import atomic_path, existing, reading
 
@@ -316,7 +317,8 @@ def _to_voxel_axes(
         if frame is None and not same:
             raise ValueError(
                 f"{name}: got no measurement frame, and voxel axes that differ from the axes of space; expected a "
-                'frame. Pass frame: "world" (the axes of space, as in ITK and 3D Slicer) or "voxel"'
+                f"frame. Pass {argument('frame', 'world')} (the axes of space, as in ITK and 3D Slicer) or "
+                f"{argument('frame', 'voxel')}"
             )
         frame = frame or ("world" if place.placed else "voxel")
     elif frame in (None, "measurement"):

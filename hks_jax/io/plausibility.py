@@ -11,6 +11,7 @@ from hks_jax.io.repair import singular_question
 from hks_jax.io.tensor_order import fsl_signs, nearest_rotation
 from hks_jax.io.units import length_question, unit_question
 from hks_jax.io.volume import AXES, TensorVolume
+from hks_jax.naming import argument
 
 ANISOTROPIC = 0.3
 """The fractional anisotropy above which a tensor's principal direction counts as the direction of a fibre."""
@@ -69,13 +70,13 @@ class Coherence(NamedTuple):
         said = f"The axes of the tensors seem right. {_SAID} {self.angle:.1f}° on average; the angle is clearly larger"
         return f"{said} {', or '.join(worse)}" if worse else ""
 
-    def question(self, option: str) -> str:
-        """Return a question whether the argument `option` is wrong, or the empty text if no other axes are better."""
+    def question(self, name: str) -> str:
+        """Return a question whether the argument `name` is wrong, or the empty text if no other axes are better."""
         best, said = self.better, f"Wrong frame? {_SAID} {self.angle:.1f}° on average along the {self.frame} axes"
         if best is None:
             return ""
         if best.is_frame:
-            return f'{said}, but only by {best.angle:.1f}° along the {best.name} axes: try {option} "{best.name}"'
+            return f"{said}, but only by {best.angle:.1f}° along the {best.name} axes: try {argument(name, best.name)}"
         return (
             f"{said}, but only by {best.angle:.1f}° with the {best.name} axis reversed. Check the signs of the "
             "gradient directions, and whether a program reoriented the image without its tensors"
@@ -168,11 +169,12 @@ def _alternatives(volume: TensorVolume) -> list[tuple[str, bool, Float[np.ndarra
     return kept[1:]
 
 
-OPEN_FRAME = (
-    "The NIfTI file does not declare the axes of its tensors, which are read along the voxel axes. If the tensors were "
-    'fitted with unchanged FSL b-vectors, as DIPY does, pass frame "fsl"'
-)
-"""The note for a NIfTI file that declares no frame, if the frames "voxel" and "fsl" differ."""
+def undeclared_frame() -> str:
+    """Return the note for a NIfTI file that declares no frame, if the frames "voxel" and "fsl" differ."""
+    return (
+        "The NIfTI file does not declare the axes of its tensors, which are read along the voxel axes. If the tensors "
+        f"were fitted with unchanged FSL b-vectors, as DIPY does, pass {argument('frame', 'fsl')}"
+    )
 
 
 def questions(volume: TensorVolume) -> tuple[str, ...]:
@@ -195,16 +197,17 @@ def questions(volume: TensorVolume) -> tuple[str, ...]:
 
 
 def reviewed(volume: TensorVolume) -> tuple[TensorVolume, tuple[str, ...]]:
-    """Return the volume, with a note about its fibres but without the note `OPEN_FRAME`, and questions on its axes."""
+    """Return the volume, with a note about its fibres instead of `undeclared_frame`, and questions on its axes."""
     found = coherence(volume) if volume.length_unit == "mm" else None
-    notes = [note for note in volume.notes if note != OPEN_FRAME]
+    undeclared = undeclared_frame()
+    notes = [note for note in volume.notes if note != undeclared]
     wrong_frame, settled = "", False
     if found is not None:
         wrong_frame = found.question("bvec_frame" if volume.order == "fit" else "frame")
         settled = any(a.is_frame and a.name == "fsl" for a in found.worse)
         if found.note and not wrong_frame:
             notes.append(found.note)
-    if OPEN_FRAME in volume.notes and not (wrong_frame or settled):
-        wrong_frame = OPEN_FRAME
+    if undeclared in volume.notes and not (wrong_frame or settled):
+        wrong_frame = undeclared
     asked = tuple(filter(None, (wrong_frame, length_question(volume), unit_question(volume))))
     return replace(volume, notes=tuple(notes)), asked

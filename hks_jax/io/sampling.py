@@ -14,6 +14,14 @@ from hks_jax.io.tensor_order import nearest_rotation
 from hks_jax.io.volume import TensorVolume
 
 
+class OutsideMaskError(ValueError):
+    """The error for points outside the mask, with the attribute `fact`, the message without its remedy."""
+
+    def __init__(self, fact: str, remedy: str) -> None:
+        super().__init__(f"{fact}. {remedy}")
+        self.fact = fact
+
+
 def sample_tensors(volume: TensorVolume, points: Any) -> Float[np.ndarray, "n 3 3"]:
     """Return the tensors of a volume at points in space, with components along the axes of space.
 
@@ -53,10 +61,10 @@ def sample_tensors(volume: TensorVolume, points: Any) -> Float[np.ndarray, "n 3 
             f"{x.min(axis=0).round(1).tolist()} … {x.max(axis=0).round(1).tolist()}"
             for x in (places, np.argwhere(inside) @ linear.T + origin)
         ]
-        raise ValueError(
+        raise OutsideMaskError(
             f"points: got {int(lost.sum())} of {len(places)} points without a voxel inside the mask around them (the "
-            f"first is point {int(np.argmax(lost))}). The points span {ends[0]} and the mask spans {ends[1]}, in mm. "
-            "Read surfaces with in_space=True, use a larger mask, or leave these points out"
+            f"first is point {int(np.argmax(lost))}). The points span {ends[0]} and the mask spans {ends[1]}, in mm",
+            "Read surfaces with in_space=True, use a larger mask, or leave these points out",
         )
     sampled = np.zeros((len(places), 3, 3))
     for i, j in zip(*np.triu_indices(3), strict=True):

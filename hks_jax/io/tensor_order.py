@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_checks import MANY
+from hks_jax.naming import argument
 
 Order = Literal["nifti", "fsl", "mrtrix", "vtk"]
 Frame = Literal["voxel", "fsl", "world", "measurement"]
@@ -110,7 +111,7 @@ class InvalidByOrder(NamedTuple):
         others = ", ".join(f'{count} in "{name}"' for name, count in self.counts.items() if name != self.order)
         return (
             f"Wrong order? Of {self.of} nonzero tensors, {self.counts[self.order]} are not positive definite in order "
-            f'"{self.order}", but {others}: try order "{self.fewer[0]}"'
+            f'"{self.order}", but {others}: try {argument("order", self.fewer[0])}'
         )
 
 
@@ -159,7 +160,7 @@ def matrices(name: str, components: Float[np.ndarray, "*shape n"], order: str | 
     if not used:
         raise ValueError(
             f"{name}: the file has {n} components per tensor and does not declare their order, which depends on the "
-            f"program. Pass order (--order), one of {choices}"
+            f"program. Pass {argument('order')}, one of {choices}"
         )
     if used not in ORDERS and used != declared:
         raise ValueError(f"order: got {used!r}; expected {choices}")

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from hks_jax.io.volume import TensorVolume
+from hks_jax.naming import argument
 
 Unit = Literal["mm2/s", "um2/ms", "um2/s", "cm2/s", "m2/s"]
 
@@ -85,7 +86,8 @@ def unit_question(volume: TensorVolume) -> str:
     for name, scale in UNITS.items():
         # If the unit is known, the numbers were converted already.
         if is_plausible(median * scale) and not volume.unit:
-            return f'{said}. If the numbers are in {name}, the median is {median * scale:.3g}: try unit "{name}"'
+            remedy = f"try {argument('unit', name)}"
+            return f"{said}. If the numbers are in {name}, the median is {median * scale:.3g}: {remedy}"
     return f"{said}. No usual unit explains this median"
 
 
@@ -123,7 +125,7 @@ def b_value_question(largest: float, unit: str) -> str:
         if low <= largest / scale <= high:
             return (
                 f"the largest b-value is {read:g}; expected {low:g} to {high:g} s/mm². If the b-values are in "
-                f'1/({name}), the largest is {largest / scale:g} s/mm²: pass unit "{name}"'
+                f"1/({name}), the largest is {largest / scale:g} s/mm²: pass {argument('unit', name)}"
             )
     return ""
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from hks_jax.io.tensor_order import matrices, nearest_rotation
 from hks_jax.io.volume import Format, TensorVolume, describe_tensors, mask_in_file, placed
+from hks_jax.naming import argument
 from hks_jax.optional import optional
 from hks_jax.storage import atomic_path, existing, load_npz, reading
 
@@ -214,7 +215,7 @@ def _tensor_array(name: str, image: Mapping[str, np.ndarray], wanted: str | None
     asked = "" if wanted is None else f" named {wanted!r}"
     raise ValueError(
         f"{name}: got the arrays (components) {listed}; expected one array of 6 or 9 components{asked}. Pass "
-        "array, the name of the array to read"
+        f"{argument('array')}, the name of the array to read"
     )
 
 

@@ -1,5 +1,6 @@
 """The command line, end to end: files in, files out, one line and a code for what goes wrong."""
 
+import argparse
 import io
 import json
 import os
@@ -17,10 +18,10 @@ import numpy as np
 import pytest
 
 import hks_jax as hj
-from hks_jax.cli import demo, fit, main
+from hks_jax.cli import COMMANDS, build_parser, demo, main
 from hks_jax.cli import outputs as outputs_module
-from hks_jax.cli.options import Option, options_in
-from hks_jax.cli.parsing import Times, parse_boundary, parse_times
+from hks_jax.cli.inputs import INPUTS
+from hks_jax.cli.parsing import Times, boundary_conditions, parse_times
 from hks_jax.cli.progress import Progress, bar, duration
 from hks_jax.eigen.solver import Status
 from hks_jax.fem.boundary import default_boundary
@@ -653,11 +654,11 @@ def test_parsing():
     assert parse_times(None) == parse_times(["auto"]) == Times((), 6)
     assert parse_times(["auto:9"]) == Times((), 9)
     assert parse_times(["3,1", "2"]) == Times((1.0, 2.0, 3.0), 0)
-    assert parse_boundary("mirror") == "mirror"
-    assert parse_boundary("mean,periodic,neumann") == ("mean", "periodic", "neumann")
-    assert parse_boundary("neumann,periodic") == ("neumann", "periodic")
-    assert parse_boundary("neumann:dirichlet,periodic") == (("neumann", "dirichlet"), "periodic")
-    assert parse_boundary("neumann:dirichlet") == (("neumann", "dirichlet"),)
+    assert boundary_conditions("mirror") == "mirror"
+    assert boundary_conditions("mean,periodic,neumann") == ("mean", "periodic", "neumann")
+    assert boundary_conditions("neumann,periodic") == ("neumann", "periodic")
+    assert boundary_conditions("neumann:dirichlet,periodic") == (("neumann", "dirichlet"), "periodic")
+    assert boundary_conditions("neumann:dirichlet") == (("neumann", "dirichlet"),)
 
 
 def test_progress_is_silent_when_quiet_but_for_warnings(capsys, monkeypatch):
@@ -718,20 +719,27 @@ def test_the_help_of_a_command_is_in_groups_and_says_what_is_hard_to_guess(capsy
         assert ("fick: the diffusion of a substance by Fick's law, div(D∇u)" in text) == (command == "hks")
 
 
-def test_a_line_of_the_table_is_an_option():
-    option = Option.of("-b,--b-max B... = 900  leave out images\n  with larger b")
-    assert (option.flags, option.name) == (("-b", "--b-max"), "b_max")
-    said = "leave out images with larger b (default 900)"
-    assert option.settings == {"help": said, "default": "900", "nargs": "+", "type": float, "metavar": "B"}
-    assert Option.of("--of a|b!  50 %").settings == {"help": "50 %%", "required": True, "choices": ("a", "b")}
-    assert Option.of("--quick  or not").settings == {"help": "or not", "action": "store_true"}
+def options_of(command):
+    """Return the options of a command, as argparse's actions."""
+    (commands,) = (action for action in build_parser()._actions if isinstance(action, argparse._SubParsersAction))
+    return commands.choices[command]._actions
+
+
+def test_each_command_states_its_required_arguments_and_its_input_files():
+    for command in COMMANDS:
+        options = options_of(command.__name__.rpartition(".")[2])
+        flags = {option: option.option_strings[:1] for option in options if option.required}
+        required = [" ".join((*flags[option], option.metavar)) for option in sorted(flags, key=lambda o: len(flags[o]))]
+        assert " ".join(required) == command.USAGE
+        files = {option.dest for option in options if option.type is Path}
+        assert files - {"output"} <= set(INPUTS)
 
 
 # ---------------------------------------------------------------------------------------------------- fits
 
 
 def test_what_fit_offers_is_what_there_is():
-    offered = {option.name: option.settings.get("choices") for option in options_in(fit.OPTIONS)}
+    offered = {option.dest: option.choices for option in options_of("fit")}
     assert (offered["parametrisation"], offered["optimiser"]) == (tuple(PARAMETRISATIONS), tuple(OPTIMISERS))
 
 

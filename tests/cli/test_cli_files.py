@@ -12,12 +12,12 @@ from matplotlib.image import imread
 
 import hks_jax as hj
 from hks_jax.cli import main
-from hks_jax.cli.options import as_options
 from hks_jax.cli.outputs import write_outputs
 from hks_jax.cli.progress import Progress
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
 from hks_jax.io.formats import format_of
 from hks_jax.io.result import Result
+from hks_jax.naming import argument, named_as_options, with_option
 
 SHAPE = (14, 12, 5)
 AFFINE = np.array([[0, -2.0, 0, 5], [2.0, 0, 0, -3], [0, 0, -3.0, 1], [0, 0, 0, 1]])
@@ -435,19 +435,44 @@ def test_signatures_come_in_the_format_of_the_tensors(tensors, tmp_path, library
     assert record["source"] == str(tensors)
 
 
-def test_messages_name_the_options():
-    for said, expected in (
-        ("x.vti: it has a and b. Pass array", "x.vti: it has a and b. Pass --array"),
-        ('fitted with b-vectors, pass frame "fsl"', "fitted with b-vectors, pass --frame fsl"),
-        ('Pass frame: "world" (the axes) or "voxel"', 'Pass --frame world (the axes) or "voxel"'),
-        ("Pass order (--order), one of these", "Pass --order, one of these"),
-        ('Pass components="largest", or components="all"', "Pass --components largest, or --components all"),
-        ("k: got 0; expected 1", "-k: got 0; expected 1"),
-        ("iterations: got -1; expected 0", "--erode: got -1; expected 0"),
-        ("b_max: 10 leaves none", "--b-max: 10 leaves none"),
-        ("outside, pass the mask or mask them", "outside, pass the mask or mask them"),
-    ):
-        assert as_options(said) == expected
+def test_messages_name_arguments_in_python_and_options_on_the_command_line():
+    def named():
+        return [argument("array"), argument("frame", "fsl"), argument("b_max", 1500), argument("clean", True)]
+
+    assert named() == ["array", 'frame="fsl"', "b_max=1500", "clean=True"]
+    assert with_option("k: got 0; expected 1") == "k: got 0; expected 1"
+    options = {"array": "--array", "frame": "--frame", "b_max": "--b-max", "clean": "--clean", "k": "-k"}
+    with named_as_options(options | {"iterations": "--erode"}):
+        assert named() == ["--array", "--frame fsl", "--b-max 1500", "--clean"]
+        assert with_option("k: got 0; expected 1") == "-k: got 0; expected 1"
+        assert with_option("iterations: got -1: too small") == "--erode: got -1: too small"
+        assert with_option("file.nii: the frame") == "file.nii: the frame"
+        assert argument("order") == "order"
+    assert named()[0] == "array"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "remedy"),
+    [
+        (["hks", "unit.npz", "--metric", "inverse", "--order", "nifti"], "--order: got 'nifti', but"),
+        (["hks", "parts.npz"], "--mask: got 2 connected components (4, 4 nodes); expected one component. Pass "),
+        (["hks", "parts.npz"], "Pass --components largest to keep the largest one, or --components all to keep all"),
+        (["hks", "parts.npz", "--components", "largest", "-k", "0"], "-k: got 0; expected an integer"),
+        (["hks", "parts.npz", "--erode", "-1"], "--erode: got -1"),
+        (
+            ["info", "six.nii.gz"],
+            "and does not declare their order, which depends on the program. Pass --order, one of",
+        ),
+    ],
+)
+def test_remedies_of_the_library_are_options(tmp_path, capsys, monkeypatch, arguments, remedy):
+    monkeypatch.chdir(tmp_path)
+    tensors = np.tile(np.eye(2), (5, 2, 1, 1))
+    np.savez("parts.npz", tensors=tensors, mask=np.arange(10).reshape(5, 2) // 2 != 2)
+    np.savez("unit.npz", tensors=tensors, length_unit="mm")
+    nib.save(nib.Nifti1Image(np.ones((3, 3, 3, 6)), np.eye(4)), "six.nii.gz")
+    more = ["-o", "out"] * (arguments[0] == "hks")
+    assert remedy in error_of(capsys, [*arguments, *more])
 
 
 def test_help(capsys):

@@ -22,8 +22,9 @@ from annotations import unchecked
 import hks_jax as hj
 from hks_jax.cli import build_parser, main
 from hks_jax.cli.computation import Settings
+from hks_jax.cli.options import defaults
 from hks_jax.cli.progress import StudyProgress
-from hks_jax.cli.study.batch import Range, common_times, suitable_range
+from hks_jax.cli.study.batch import Range, add_kept, common_times, suitable_range
 from hks_jax.cli.study.folder import Study
 from hks_jax.cli.study.subjects import read_subjects
 from hks_jax.cli.study.tasks import Outcome
@@ -379,7 +380,9 @@ def test_numbers_without_a_unit_are_compared_within_the_study(study, monkeypatch
 
 
 def test_a_subject_is_done_again_when_its_sidecar_changes(study):
-    rows = read_subjects(study / "subjects.tsv", build_parser().parse_args(command(study, "out")))
+    args = build_parser().parse_args(command(study, "out"))
+    vars(args).update({name: value for name, value in defaults(add_kept).items() if getattr(args, name) is None})
+    rows = read_subjects(study / "subjects.tsv", args)
     whole = Study(study / "out", Settings.of(metric="inverse"), "scanner", {})
     before = [whole.fingerprint(row) for row in rows]
     for name in ("t1", "sub-2_param-txx"):

@@ -99,12 +99,12 @@ def test_its_fibres_tell_mirrored_and_turned_tensors():
         mirrored = replace(right, tensors=right.tensors * np.outer(signs, signs))
         (question,) = hj.io.questions(mirrored)
         assert question.startswith("Wrong frame?")
-        assert f"{'xyz'[axis]} axis reversed" in question or (axis == 0 and 'try frame "world"' in question)
+        assert f"{'xyz'[axis]} axis reversed" in question or (axis == 0 and 'try frame="world"' in question)
     # Stored from the other side, the determinant is positive: FSL's axes are not the voxels' then.
     turned = replace(right, affine=right.affine @ np.diag([-1.0, 1, 1, 1]), mask=right.inside[::-1])
     signs = np.outer([-1, 1, 1], [-1, 1, 1]).astype(np.float32)
     (question,) = hj.io.questions(replace(turned, tensors=right.tensors[::-1]))
-    assert 'try frame "fsl"' in question
+    assert 'try frame="fsl"' in question
     assert hj.io.questions(replace(turned, tensors=right.tensors[::-1] * signs)) == ()
 
 

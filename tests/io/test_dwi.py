@@ -227,7 +227,7 @@ def test_b_values_in_another_unit_are_refused_until_it_is_told(scan, capsys, uni
     expected = scan.fit(head())
     scan.b *= scale
     with pytest.raises(
-        ValueError, match=rf'[/\\]b: the largest b-value is .* the largest is 1000 s/mm².*pass unit "{unit}"'
+        ValueError, match=rf'[/\\]b: the largest b-value is .* the largest is 1000 s/mm².*pass unit="{unit}"'
     ):
         scan.fit(head())
     told = scan.fit(head(), unit=unit, b_max=1200)

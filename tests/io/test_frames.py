@@ -12,7 +12,7 @@ from dipy.reconst.dti import TensorModel, lower_triangular
 
 from hks_jax.cli import main
 from hks_jax.io import TensorVolume, fit_dwi, questions, read_tensors, save_tensors
-from hks_jax.io.plausibility import OPEN_FRAME, coherence
+from hks_jax.io.plausibility import coherence, undeclared_frame
 from hks_jax.io.tensor_order import pack
 
 SHAPE = (26, 24, 14)
@@ -84,7 +84,7 @@ def test_a_reversed_axis_shows(tmp_path, axis):
     mirrored = bundles(0.1) * np.outer(signs, signs)
     (question,) = questions(read_tensors(write(tmp_path / "t.nii.gz", mirrored, affine(0, flip=True))))
     # In an image with x reversed, the scanner's axes are the voxels' with x reversed.
-    wanted = 'along the world axes: try frame "world"' if axis == 0 else f"with the {'xyz'[axis]} axis reversed"
+    wanted = 'along the world axes: try frame="world"' if axis == 0 else f"with the {'xyz'[axis]} axis reversed"
     assert question.startswith(WRONG)
     assert wanted in question
 
@@ -96,7 +96,7 @@ def test_scanner_axes_in_an_oblique_image_show(tmp_path, degrees, flip):
     world = turn @ bundles(0.1) @ turn.T
     path = write(tmp_path / "t.nii.gz", world, affine(degrees, flip))
     (question,) = questions(read_tensors(path))
-    assert 'along the world axes: try frame "world"' in question
+    assert 'along the world axes: try frame="world"' in question
     told = read_tensors(path, frame="world")
     assert questions(told) == ()
     np.testing.assert_allclose(told.tensors, bundles(0.1), atol=1e-9)
@@ -136,7 +136,7 @@ def test_what_decides_nothing_is_no_question():
     for tensors in (straight, anything, bundles()[:4, :4], np.broadcast_to(1e-3 * np.eye(3), (*SHAPE, 3, 3))):
         volume = TensorVolume(tensors, SPACING, (0.0,) * 3, **placed)
         assert questions(volume) == ()
-        assert questions(replace(volume, notes=(OPEN_FRAME,))) == (OPEN_FRAME,)
+        assert questions(replace(volume, notes=(undeclared_frame(),))) == (undeclared_frame(),)
     assert coherence(TensorVolume(bundles(), SPACING, (0.0,) * 3, **placed).slice("z", 2)) is None
     holes = bundles()
     holes[::2, 3] = np.nan
@@ -167,7 +167,7 @@ def scan(tmp_path):
 def test_the_mirrored_tensors_of_dipy_are_noticed(scan, capsys):
     path = str(scan / "dipy.nii.gz")
     (question,) = questions(read_tensors(path))
-    assert 'along the fsl axes: try frame "fsl"' in question
+    assert 'along the fsl axes: try frame="fsl"' in question
     assert questions(read_tensors(path, frame="fsl")) == ()
     np.testing.assert_allclose(read_tensors(path, frame="fsl").tensors, bundles(), atol=2e-8)
     assert main(["convert", path, str(scan / "o.nii.gz"), "-q"]) == 0
@@ -185,7 +185,7 @@ def test_gradient_directions_along_other_axes(scan, tmp_path, capsys):
     np.testing.assert_allclose(right.tensors, bundles(), atol=2e-8)
     assert questions(right) == ()
     (question,) = questions(fit_dwi(*names, everywhere, bvec_frame="voxel"))
-    assert 'along the fsl axes: try bvec_frame "fsl"' in question
+    assert 'along the fsl axes: try bvec_frame="fsl"' in question
     np.savetxt(scan / "voxel", np.loadtxt(scan / "g") * [[-1], [1], [1]])
     np.testing.assert_allclose(
         fit_dwi(*names[:2], scan / "voxel", everywhere, bvec_frame="voxel").tensors, right.tensors, atol=1e-9
@@ -220,7 +220,7 @@ def test_own_files_say_along_which_axes_they_are(scan, capsys):
     capsys.readouterr()
     own = read_tensors(out)
     np.testing.assert_allclose(own.tensors, bundles(), atol=2e-8)
-    assert OPEN_FRAME not in own.notes
+    assert undeclared_frame() not in own.notes
     assert own.frame == "voxel"
     record = json.loads(nib.load(out).header.extensions[0].get_content())
     assert [record[key] for key in ("order", "frame", "source_order", "source_frame")] == [
@@ -252,12 +252,12 @@ def test_own_files_say_along_which_axes_they_are(scan, capsys):
 def test_the_record_of_an_image_that_was_turned_since_is_not_believed(tmp_path):
     volume = TensorVolume(bundles(), SPACING, (0.0,) * 3, affine=affine(), length_unit="mm")
     image = nib.load(save_tensors(tmp_path / "t.nii.gz", volume))
-    assert OPEN_FRAME not in read_tensors(tmp_path / "t.nii.gz").notes
+    assert undeclared_frame() not in read_tensors(tmp_path / "t.nii.gz").notes
     moved = nib.Nifti1Image(image.get_fdata(), image.affine, image.header)
     nib.save(moved, tmp_path / "copy.nii.gz")  # by nibabel, which keeps the record
-    assert OPEN_FRAME not in read_tensors(tmp_path / "copy.nii.gz").notes
+    assert undeclared_frame() not in read_tensors(tmp_path / "copy.nii.gz").notes
     nib.save(image.as_reoriented(np.array([[0, -1], [1, -1], [2, 1]])), tmp_path / "turned.nii.gz")
-    assert OPEN_FRAME in read_tensors(tmp_path / "turned.nii.gz").notes
+    assert undeclared_frame() in read_tensors(tmp_path / "turned.nii.gz").notes
 
 
 @pytest.mark.parametrize(
@@ -268,7 +268,7 @@ def test_a_sidecar_says_the_axes_of_one_image(tmp_path, reference, frame):
     (tmp_path / "sub-01_dwimap.json").write_text(json.dumps({"OrientationEncoding": {"Reference": reference}}))
     read = read_tensors(path)
     assert read.frame == frame
-    assert OPEN_FRAME not in read.notes
+    assert undeclared_frame() not in read.notes
     np.testing.assert_array_equal(read.tensors, read_tensors(path, frame=frame).tensors)
     # A file that `save_tensors` writes beside an old sidecar is along the voxel axes.
     own = read_tensors(save_tensors(path, read))

@@ -510,7 +510,7 @@ def test_tensors_that_dipy_fitted_and_wrote(tmp_path, flip):
     axes = affine[:3, :3] / np.linalg.norm(affine[:3, :3], axis=0)
     sign = np.diag([-1.0 if np.linalg.det(affine) > 0 else 1.0, 1, 1])
     np.testing.assert_allclose(axes @ read.tensors[0, 0, 0] @ axes.T, axes @ sign @ D @ sign @ axes.T, rtol=1e-4)
-    note = 'pass frame "fsl"'
+    note = 'pass frame="fsl"'
     assert any(note in text for text in hj.io.read_tensors(tmp_path / "t.nii.gz").notes) == (np.linalg.det(affine) > 0)
 
 

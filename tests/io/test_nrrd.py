@@ -129,7 +129,7 @@ def test_a_measurement_frame_that_scales_does_so(tmp_path, tensors):
 
 def test_axes_that_no_measurement_frame_settles_are_refused(tmp_path, tensors):
     path = write(tmp_path / "t.nrrd", components(tensors), "3D-symmetric-matrix", **placed())
-    with pytest.raises(ValueError, match=r'Pass frame: "world".*or "voxel"'):
+    with pytest.raises(ValueError, match=r'Pass frame="world".*or frame="voxel"'):
         read_tensors(path)
     with pytest.raises(ValueError, match="no measurement frame"):
         read_tensors(path, frame="measurement")

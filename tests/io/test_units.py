@@ -159,7 +159,7 @@ def test_a_wrong_unit_is_asked_about_and_can_be_told(tmp_path, unit, scale, dtyp
     path = write(tmp_path / "t.nii", "mm", 2.0, scale, dtype)
     (question,) = questions(read_tensors(path))
     assert f"Wrong unit? The median mean diffusivity is {7e-4 * scale:.3g} mm²/s" in question
-    assert f'If the numbers are in {unit}, the median is 0.0007: try unit "{unit}"' in question
+    assert f'If the numbers are in {unit}, the median is 0.0007: try unit="{unit}"' in question
     told = read_tensors(path, unit=unit)
     np.testing.assert_allclose(told.tensors, np.broadcast_to(D, (*SHAPE, 3, 3)), rtol=1e-6)
     assert (told.unit, told.tensors.dtype) == ("mm²/s", dtype)
@@ -225,5 +225,5 @@ def test_a_mesh_has_none_of_these_options(tmp_path, capsys, option):
 )
 def test_b_values_in_another_unit(largest, unit):
     question = b_value_question(largest, "mm2/s")
-    assert (f'pass unit "{unit}"' in question) if unit else question == ""
-    assert f'pass unit "{unit or "mm2/s"}"' in b_value_question(largest, "cm2/s" if unit else "um2/s")
+    assert (f'pass unit="{unit}"' in question) if unit else question == ""
+    assert f'pass unit="{unit or "mm2/s"}"' in b_value_question(largest, "cm2/s" if unit else "um2/s")

@@ -172,7 +172,7 @@ def test_validity_tells_orders_apart_but_for_the_two_with_the_diagonal_first(ord
         assert found.of == 200
         assert found.counts[order] == 0
         assert order in found.fewer[:2]
-        assert f'try order "{found.fewer[0]}"' in found.question
+        assert f'try order="{found.fewer[0]}"' in found.question
     noise = tensors.copy()
     noise[:5] *= -1
     assert invalid_by_order(pack(noise, order), order) is None  # a few are no sign of a wrong order

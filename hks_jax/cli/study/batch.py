@@ -40,15 +40,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hks_jax.cli import options
 from hks_jax.cli.computation import ComputationError, Settings
 from hks_jax.cli.info import describe
 from hks_jax.cli.inputs import require_inputs_kept
-from hks_jax.cli.noise import check_noise, second_scan
-from hks_jax.cli.options import FILES, READING, SOLVING, defaults, flag, options_in, refuse
+from hks_jax.cli.noise import check_noise
+from hks_jax.cli.options import FILES, defaults, flag, refuse
 from hks_jax.cli.outputs import Done, show
-from hks_jax.cli.parsing import Times
+from hks_jax.cli.parsing import Times, folder
 from hks_jax.cli.progress import Progress, StudyProgress
-from hks_jax.cli.reading import read_volume, require_metric
+from hks_jax.cli.reading import Reading, is_file, read_volume, require_metric
 from hks_jax.cli.study.folder import DESCRIPTIONS, MAP, PAIRS, REGIONS, Study, reading_options
 from hks_jax.cli.study.subjects import Subject, read_subjects
 from hks_jax.io import TensorVolume
@@ -58,26 +59,52 @@ from hks_jax.io.units import LIVING_TISSUE
 from hks_jax.signatures.spans import SHORTEST
 from hks_jax.signatures.times import LAST
 
-KEPT = f"""
-@metric {READING} {SOLVING} @signature @noise
---time-unit scanner|lambda1 = scanner
-    unit of --times: scanner, for the same t for all subjects, in seconds for D in mm²/s with the metric D⁻¹ or Fick's
-    operator (default); or lambda1,
-    for the same product λ₁t, so that the given numbers are divided by each subject's first positive eigenvalue λ₁.
-    Automatic times are log-spaced over the range that suits all subjects, and the study keeps them
-"""
-DEFAULTS = {option.name: None for option in options_in(KEPT) if option.name not in FILES}
+USAGE = "SUBJECTS -o DIR"
+
+
+def add_kept(parser: argparse.ArgumentParser) -> None:
+    """Add the options that a study keeps."""
+    options.add_metric(parser)
+    options.add_reading(parser)
+    options.add_solving(parser)
+    options.add_signature(parser)
+    options.add_noise(parser)
+    parser.add_argument(
+        "--time-unit",
+        choices=("scanner", "lambda1"),
+        default="scanner",
+        help="unit of --times: scanner, for the same t for all subjects, in seconds for D in mm²/s with the metric "
+        "D⁻¹ or Fick's operator (default); or lambda1, for the same product λ₁t, so that the given numbers are "
+        "divided by each subject's first positive eigenvalue λ₁. Automatic times are log-spaced over the range that "
+        "suits all subjects, and the study keeps them",
+    )
+
+
+DEFAULTS = dict.fromkeys(name for name in defaults(add_kept) if name not in FILES)
 """The options that a study keeps, with the default None, by which omitted options are recognised."""
-OPTIONS = f"""
-subjects SUBJECTS  the table of subjects
--o,--output DIR!  the study's folder
-{KEPT}
-@atlas @names @view @rim
---save-pairs
-    save the eigenpairs of each subject, which other --times, --normalisation or --method then reuse
---replace  replace a study in DIR that has other settings or times
---only SUBJECT...  compute only these subjects, such as sub-07 or sub-07_ses-2
-"""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    parser.add_argument("subjects", type=Path, metavar="SUBJECTS", help="the table of subjects")
+    parser.add_argument("-o", "--output", type=folder, required=True, metavar="DIR", help="the study's folder")
+    add_kept(parser)
+    parser.set_defaults(**DEFAULTS)
+    options.add_atlas(parser)
+    options.add_names(parser)
+    options.add_view(parser)
+    options.add_rim(parser)
+    parser.add_argument(
+        "--save-pairs",
+        action="store_true",
+        help="save the eigenpairs of each subject, which other --times, --normalisation or --method then reuse",
+    )
+    parser.add_argument(
+        "--replace", action="store_true", help="replace a study in DIR that has other settings or times"
+    )
+    parser.add_argument(
+        "--only", nargs="+", metavar="SUBJECT", help="compute only these subjects, such as sub-07 or sub-07_ses-2"
+    )
 
 
 def writes(args: argparse.Namespace) -> list[Path]:
@@ -89,7 +116,7 @@ def run(args: argparse.Namespace, begun: Progress) -> None:
     """Run the command; if some subjects fail, raise ComputationError after computing the others."""
     from hks_jax.cli.study.tasks import run_all
 
-    if second_scan(args) is not None:
+    if is_file(args.noise):
         why = "for all subjects; expected a number, residuals or roughness"
         raise ValueError(f"--noise: got {args.noise} {why}. Put second scans into a column named noise of the table")
     args.strict_unit = True
@@ -99,7 +126,7 @@ def run(args: argparse.Namespace, begun: Progress) -> None:
     for subject in chosen:
         if subject.arguments is not None:
             require_inputs_kept(subject.arguments)
-            require_metric(subject.arguments)
+            require_metric(Reading.of(subject.arguments))
             check_noise(subject.arguments)
     if not any(s.arguments is not None and s.arguments.atlas is not None for s in subjects):
         refuse(args, ("names",), "this option names labels, which are missing; pass --atlas, or a column named atlas")
@@ -167,7 +194,7 @@ def _complete(args: argparse.Namespace) -> str:
             setattr(args, name, Path(path))
             taken.append(f"{flag(name)} {path}")
     # Comparable subjects need the same boundary condition, with or without a mask.
-    usual = {**vars(defaults(KEPT)), "boundary": "mean"}
+    usual = {**defaults(add_kept), "boundary": "mean"}
     for name in DEFAULTS:
         if getattr(args, name) is None:
             value = kept.get(name, usual[name])
@@ -237,7 +264,7 @@ def _suitable(
     for number, subject in enumerate(subjects, 1):
         progress.update(f"choosing times: {subject.name}, {number} of {len(subjects)}")
         try:
-            ranges[subject.name] = suitable_range(read_volume(subject.args, silent), subject.args)
+            ranges[subject.name] = suitable_range(read_volume(Reading.of(subject.args), silent), subject.args)
         except Exception as error:  # reported when the subject is computed
             first = first or f"{subject.name}: {error}"
     if not ranges:

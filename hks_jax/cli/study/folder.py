@@ -13,10 +13,9 @@ from typing import Any
 
 from hks_jax import __version__
 from hks_jax.cli.computation import Settings
-from hks_jax.cli.inputs import tensor_files
-from hks_jax.cli.noise import second_scan
 from hks_jax.cli.options import COLUMNS
 from hks_jax.cli.parsing import Times
+from hks_jax.cli.reading import Reading, is_file
 from hks_jax.cli.study.subjects import Subject
 from hks_jax.io.formats import format_of
 from hks_jax.io.masks import names_beside
@@ -79,7 +78,7 @@ class Study:
 
     def fingerprint(self, subject: Subject) -> str:
         """Return a digest of all inputs of a subject's signature; raise FileNotFoundError if a file is missing."""
-        reading, inputs = reading_options(subject.args), tensor_files(subject.args)
+        reading, inputs = reading_options(subject.args), Reading.of(subject.args).files
         files = {role: [digest(existing(path)) for path in paths] for role, paths in inputs.items()}
         return _digest({"settings": asdict(self.settings), "unit": self.time_unit, "reading": reading, "files": files})
 
@@ -116,7 +115,7 @@ class Study:
             "TimesDescription": times_text(self.time_unit),
             "Units": report["units"],
             "Rim": report["rim"],
-            "Sources": [os.path.basename(path) for paths in tensor_files(args).values() for path in paths],
+            "Sources": [os.path.basename(path) for paths in Reading.of(args).files.values() for path in paths],
             "Input": _without_folder(report["input"]),
             "Eigenpairs": report["eigenpairs"],
             "Truncation": report["times"],
@@ -204,7 +203,7 @@ def reading_options(args: argparse.Namespace) -> dict[str, Any]:
     """Return the options for reading and noise; "file" replaces the path of a second scan, because files may move."""
     names = [option for option in COLUMNS if args.noise is not None or option not in ("noise", "draws")]
     reading = {option: getattr(args, option.replace("-", "_")) for option in names}
-    return reading if second_scan(args) is None else {**reading, "noise": "file"}
+    return {**reading, "noise": "file"} if is_file(args.noise) else reading
 
 
 def times_text(unit: str) -> str:

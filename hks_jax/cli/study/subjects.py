@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NoReturn
 
-from hks_jax.cli.noise import second_scan
-from hks_jax.cli.options import COLUMNS, FILES, READING, add_options
+from hks_jax.cli.options import COLUMNS, FILES, add_atlas, add_file, add_names, add_noise, add_reading
+from hks_jax.cli.reading import is_file
 from hks_jax.io.tables import read_table
 
 
@@ -61,7 +61,8 @@ def read_subjects(path: Path, common: argparse.Namespace) -> list[Subject]:
     `participant_id`, for a label that BIDS does not allow, and for a duplicate subject and session.
     """
     rows, parser = read_table(path), _RowParser(add_help=False)
-    add_options(parser, f"@file {READING} @noise @atlas @names")
+    for add in (add_file, add_reading, add_noise, add_atlas, add_names):
+        add(parser)
     subjects: dict[str, Subject] = {}
     if not any("participant_id" in row for row in rows):
         names = ", ".join(dict.fromkeys(name for row in rows for name in row))
@@ -76,7 +77,7 @@ def read_subjects(path: Path, common: argparse.Namespace) -> list[Subject]:
             if not words or words[0].startswith("--"):
                 raise ValueError("got no file; expected a file in every row")
             arguments, problem = parser.parse_args(words, copy.copy(common)), ""
-            if second_scan(arguments) is not None:
+            if is_file(arguments.noise):
                 arguments.noise = str(path.parent / arguments.noise)
         except ValueError as error:
             arguments, problem = None, str(error)

@@ -12,14 +12,13 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from hks_jax.cli import INPUT_ERRORS
-from hks_jax.cli.computation import ComputationError, Solved, compute_pairs
-from hks_jax.cli.noise import noise_of_volume, signature_of
+from hks_jax.cli.computation import INPUT_ERRORS, ComputationError, Solved, compute_pairs, domain_of_volume
+from hks_jax.cli.noise import noise_of, signature_of
 from hks_jax.cli.outputs import PictureError, draw_picture
 from hks_jax.cli.pairs import are_of, read_pairs, write_pairs
 from hks_jax.cli.parsing import Times
 from hks_jax.cli.progress import StudyProgress
-from hks_jax.cli.reading import read_volume
+from hks_jax.cli.reading import Reading, read_volume
 from hks_jax.cli.stats import region_table
 from hks_jax.cli.study.folder import MAP, PAIRS, REGIONS, Study
 from hks_jax.cli.study.subjects import Subject
@@ -149,17 +148,18 @@ class _Task(NamedTuple):
 
 def _compute(study: Study, subject: Subject, fingerprint: str, progress: StudyProgress) -> Result:
     study.forget(subject)
-    args, solved = subject.args, _pairs(study, subject, progress)
+    args, reading, solved = subject.args, Reading.of(subject.args), _pairs(study, subject, progress)
     scaled: dict[str, np.ndarray] = {}
     if study.time_unit == "lambda1":
         scaled["scaled_times"] = np.array(study.settings.times.explicit)
         own = scaled["scaled_times"] / float(positive_range(solved.pairs)[0])
         solved = solved._replace(settings=replace(solved.settings, times=Times(tuple(own.tolist()), 0)))
-    if args.noise == "residuals" and solved.volume.covariance is None:  # covariances are not saved with eigenpairs
-        volume = read_volume(args, StudyProgress(1, quiet=True, stream=io.StringIO()))
-        solved = solved._replace(volume=volume.with_mask(solved.volume.mask))
-    noise = noise_of_volume(args, solved.volume, solved.field.grid, progress)
-    result = signature_of(args, solved, noise, progress)
+    domain, volume = solved.domain, solved.domain.volume
+    if args.noise == "residuals" and volume is not None and volume.covariance is None:  # not saved with eigenpairs
+        again = read_volume(reading, StudyProgress(1, quiet=True, stream=io.StringIO()))
+        domain = replace(domain, volume=again.with_mask(volume.mask))
+    noise = noise_of(domain, reading, args.draws, progress)
+    result = signature_of(solved, noise, progress)
     result = replace(result, arrays={**scaled, **result.arrays})
     with progress.stage("writing"):
         study.write_signature(subject, fingerprint, result, progress.warnings)
@@ -170,10 +170,12 @@ def _pairs(study: Study, subject: Subject, progress: StudyProgress) -> Solved:
     """Return saved eigenpairs, or compute eigenpairs and save them if the study saves eigenpairs."""
     kept, fingerprint = study.path(subject, PAIRS), study.pairs_fingerprint(subject)
     if are_of(kept, fingerprint):
-        return read_pairs(kept, study.settings, progress)[0]
+        return read_pairs(kept, study.settings, progress)
     kept.unlink(missing_ok=True)
-    solved = compute_pairs(read_volume(subject.args, progress), study.settings, progress)
+    volume = read_volume(Reading.of(subject.args), progress)
+    domain = domain_of_volume(volume, study.settings, format_of(subject.args.file).image)
+    solved = compute_pairs(domain, study.settings, progress)
     if study.save_pairs:
         with progress.stage("writing"):
-            write_pairs(kept, solved, format_of(subject.args.file).image, progress.warnings, fingerprint)
+            write_pairs(kept, solved, progress.warnings, fingerprint)
     return solved
