@@ -38,7 +38,8 @@ LIBRARIES := $(addprefix tests/,project/test_import.py io/test_io.py io/test_nrr
     cli/test_cli.py::test_npz_end_to_end_equals_the_library)
 LOWEST := $(VENV)/lowest
 
-.PHONY: browser demo test test-slow test-optimised test-lowest stress lint notebooks docs tables dist clean
+.PHONY: browser demo test test-slow test-optimised test-lowest stress lint notebooks docs dist tools tables \
+    clean
 .DELETE_ON_ERROR:
 
 demo: $(STAMPS)/dti $(STAMPS)/brain
@@ -66,9 +67,10 @@ lint: $(STAMPS)/lint
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# Two at a time, as each leaves a core idle half of its time.
+# Two at a time, as each leaves a core idle half of its time; compiled as in tests.
 notebooks: $(STAMPS)/dti $(STAMPS)/train $(STAMPS)/brain
-	printf '%s\n' notebooks/*.py | MPLBACKEND=Agg $(ONE_THREAD) xargs -P 2 -n 1 -t $(BIN)/python
+	export XLA_FLAGS="$$($(BIN)/python tests/compiler_flags.py)" && \
+	    printf '%s\n' notebooks/*.py | MPLBACKEND=Agg $(ONE_THREAD) xargs -P 2 -n 1 -t $(BIN)/python
 
 # Not --quiet: what is not printed is not counted, and the build would pass with broken links.
 docs: $(STAMPS)/docs
@@ -103,11 +105,16 @@ $(STAMPS)/venv:
 	$(PYTHON) -m venv $(VENV)
 	@mkdir -p $(STAMPS) && touch $@
 
-# One extra of pyproject.toml each: dti, train, test, lint, docs, dist.
+# One extra of pyproject.toml each: dti, train, test, lint, docs, dist. That for tests includes the first two.
 EXTRAS := $(addprefix $(STAMPS)/,dti train test lint docs dist)
 $(EXTRAS): $(STAMPS)/%: pyproject.toml $(STAMPS)/venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[$*]"
-	@touch $@
+	@touch $@ $(if $(filter test,$*),$(STAMPS)/dti $(STAMPS)/train)
+
+# Three extras at once, so that lint, docs and dist can then run beside each other: pip cannot.
+tools: $(STAMPS)/venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[lint,docs,dist]"
+	@touch $(addprefix $(STAMPS)/,lint docs dist)
 
 # Of what the libraries require in turn, the newest.
 $(STAMPS)/lowest: pyproject.toml $(STAMPS)/venv

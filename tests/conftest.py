@@ -7,19 +7,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import jax
-import jaxlib
 import jaxtyping
 import matplotlib
 import numpy as np
 import pytest
+from compiler_flags import FLAGS
 
 # From here on every call of a function of the package is checked against its annotations, shapes included.
 jaxtyping.install_import_hook("hks_jax", "annotations.checked")
 
-# Tests are small and many: they wait for the compiler, which without these flags takes four times as long.
-FLAGS = ["--xla_backend_optimization_level=0", "--xla_llvm_disable_expensive_passes=true"]
-if jaxlib.__version__.startswith("0.10."):  # an unknown flag would be fatal
-    FLAGS += ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
 os.environ.setdefault("XLA_FLAGS", " ".join(FLAGS))
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -39,10 +35,26 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(20140101)
 
 
+def resident() -> int:
+    """Return the memory that the process has, in bytes, or where the system does not tell, the most that it had."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
+
+
+enough = 3 << 30
+
+
 @pytest.fixture(autouse=True, scope="module")
 def forget_what_was_compiled() -> Iterator[None]:
-    """Clear the caches once the process has needed 3 GiB: a thousand tests compile more than fits into memory."""
+    """Clear the caches when the process has come to 3 GiB: a thousand tests compile more than fits into memory.
+
+    That takes seconds, and what is freed serves again before the process grows: they are cleared when it has grown.
+    """
+    global enough
     yield
-    if resource.getrusage(resource.RUSAGE_SELF).ru_maxrss > 3 << 20:  # KiB
+    if resident() > enough:
         jax.clear_caches()
         gc.collect()
+        enough = max(enough, resident() + (1 << 29))

@@ -3,6 +3,7 @@
 The field has a mask, so that results contain the NaN that is meant, and is so small that the dense solver serves it.
 """
 
+import gc
 import warnings
 from collections.abc import Callable
 from functools import cache, partial
@@ -161,7 +162,12 @@ def run_strictly(name: str) -> Any:
 def run_guarded(name: str) -> Any:
     """Compile one of the steps where JAX forbids leaks of tracers, and run it where JAX forbids implicit transfers."""
     tensors = jax.device_put(TENSORS)
-    with jax.checking_leaks():
-        step = jax.jit(partial(STEPS[name])).lower(tensors).compile()
+    gc.collect()
+    gc.freeze()  # after each trace JAX looks for leaks in all objects but those that are frozen
+    try:
+        with jax.checking_leaks():
+            step = jax.jit(partial(STEPS[name])).lower(tensors).compile()
+    finally:
+        gc.unfreeze()
     with jax.transfer_guard("disallow"):
         return quietly(partial(step, tensors))

@@ -215,10 +215,13 @@ def reading(grid, boundary, interpolation="linear", k=6):
 @pytest.mark.parametrize(
     ("grid", "boundary", "interpolation"),
     [
-        (hj.Grid((5, 4), (0.8, 1.1), mask=MASK), "neumann", "linear"),
-        (hj.Grid((5, 4), mask=MASK), "mean", "log-euclidean"),
+        (hj.Grid((5, 4), (0.8, 1.1), mask=MASK), "mean", "log-euclidean"),
         (hj.Grid((3, 4)), ("mirror", "dirichlet"), "linear"),
-        (hj.Grid((3, 3, 3), (1.0, 0.7, 1.2)), ("periodic", *["neumann"] * 2), "linear"),
+        (
+            hj.Grid((3, 3, 3), (1.0, 0.7, 1.2), mask=np.arange(27).reshape(3, 3, 3) > 0),
+            ("periodic", *["neumann"] * 2),
+            "linear",
+        ),
     ],
 )
 def test_gradients_agree_with_differences(rng, grid, boundary, interpolation):

@@ -1,6 +1,7 @@
 """Fits of metrics to signatures."""
 
 import pickle
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -508,16 +509,11 @@ def test_error_bars_of_a_fit_are_those_of_its_posterior():
 
 
 @pytest.mark.slow
-def test_identifiability_is_the_spectrum_of_the_information(rng):
-    # On the smaller grid the weakest direction takes more iterations than these.
-    grid, times, k = hj.Grid((14, 14), 1 / 13), np.geomspace(0.012, 0.15, 4), 196
-    factor = np.exp(0.4 * np.sin(2 * grid.nodes[..., 0]) * np.cos(3 * grid.nodes[..., 1]))[..., None, None]
-    target = signature(hj.TensorField(grid, factor * np.eye(2)), k, times)
-    flat = hj.TensorField(grid, np.broadcast_to(np.eye(2), (14, 14, 2, 2)))
-    fit = hj.fit_metric(flat, target, times, "conformal", k=k, search=Search(max_steps=2))
+def test_identifiability_is_the_spectrum_of_the_information():
+    fit = hj.fit_metric(FLAT, signature(CONFORMAL), TIMES, "conformal", k=K, search=Search(max_steps=2))
     problem = fit.problem
-    report = identifiability(fit, n=12, n_weak=2, iterations=6)
-    jacobian = jax.jacfwd(lambda v: problem.observation.residuals(problem.pairs(v)))(fit.values)
+    report = identifiability(fit, n=12, n_weak=2, iterations=12)
+    jacobian = jax.jit(jax.jacfwd(lambda v: problem.observation.residuals(problem.pairs(v))))(fit.values)
     information = np.asarray(jacobian.reshape(len(jacobian), -1))
     exact = np.linalg.eigvalsh(information.T @ information)
     np.testing.assert_allclose(report.strengths[:8], exact[::-1][:8], rtol=0.02)
@@ -525,9 +521,10 @@ def test_identifiability_is_the_spectrum_of_the_information(rng):
     assert ((report.resolution >= 0) & (report.resolution <= 1)).all()
     assert 0 < report.effective <= 12
     assert (report.deviation <= 1).all()
-    # Fewer times, less information.
-    fewer = hj.fit_metric(flat, target[2:], times[2:], "conformal", k=k, search=Search(max_steps=1))
-    poorer = identifiability(fewer.problem, fit.values, n=12, n_weak=1, iterations=6)
+    # Fewer times, less information; weights that are nearly zero leave times out without another compilation.
+    fewer = Data(weights=np.repeat([1e-30, 1.0], 2 * K).reshape(4, N, N))
+    observation, _ = observe(signature(CONFORMAL), TIMES, fewer, hj.assemble(FLAT).space, np.float64)
+    poorer = identifiability(replace(problem, observation=observation), fit.values, n=12, n_weak=2, iterations=12)
     assert poorer.strengths[11] < report.strengths[11]
 
 

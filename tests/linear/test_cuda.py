@@ -37,6 +37,20 @@ def solid(vertices):
     return hj.TetMesh(vertices, BALL.cells)
 
 
+def signatures(tensors):
+    """All that is read off the same pairs."""
+    known = pairs(tensors)
+    return (
+        hj.wks(known, jnp.array([-1.0, 1.0]), 0.5),
+        hj.scale_invariant_hks(known),
+        hj.heat_kernel(known, TIMES, [(3, 4)]),
+        hj.diffusion_distance(known, TIMES, [(3, 4)]),
+        hj.biharmonic_distance(known, [(3, 4)]),
+        hj.heat_trace(known, TIMES),
+        hj.heat_flow(known, TIMES, jnp.ones(tensors.shape[:2])),
+    )
+
+
 COLOURING = hj.colouring(grid(PLANE), TIMES)
 
 COMPUTATIONS = {
@@ -47,16 +61,10 @@ COMPUTATIONS = {
     "mean": (lambda T: signature(grid(T), "dense", "mean"), PLANE),
     "surface": (lambda v: signature(surface(v), "block-lanczos"), SPHERE.vertices),
     "solid": (lambda v: signature(solid(v), "dense", "dirichlet"), BALL.vertices),
-    "wks": (lambda T: hj.wks(pairs(T), jnp.array([-1.0, 1.0]), 0.5), PLANE),
-    "scale-invariant": (lambda T: hj.scale_invariant_hks(pairs(T)), PLANE),
-    "heat kernel": (lambda T: hj.heat_kernel(pairs(T), TIMES, [(3, 4)]), PLANE),
-    "diffusion distance": (lambda T: hj.diffusion_distance(pairs(T), TIMES, [(3, 4)]), PLANE),
-    "biharmonic distance": (lambda T: hj.biharmonic_distance(pairs(T), [(3, 4)]), PLANE),
-    "heat trace": (lambda T: hj.heat_trace(pairs(T), TIMES), PLANE),
+    "signatures": (signatures, PLANE),
     "count": (lambda T: hj.count_eigenvalues(grid(T), 1.0), PLANE),
     "colouring": (lambda T: hj.hks_spectrum_free(grid(T), TIMES, method=COLOURING), PLANE),
     "selected inversion": (lambda T: hj.hks_spectrum_free(grid(T), TIMES, method="selected-inversion"), PLANE),
-    "heat flow": (lambda T: hj.heat_flow(pairs(T), TIMES, jnp.ones(T.shape[:2])), PLANE),
     "curvature": (lambda T: hj.gaussian_curvature(grid(T)), PLANE),
     "scalar curvature": (lambda T: hj.scalar_curvature(grid(T)), VOLUME),
     "expansion": (lambda T: hj.hks_expansion(grid(T), TIMES), PLANE),

@@ -9,22 +9,20 @@ from concurrent_programs import PROGRAMS, run
 PACKAGE = Path(__file__).parents[2] / "hks_jax"
 
 
-@pytest.mark.slow
-def test_a_program_that_stopped_within_two_calls():
-    run(["count, mirror"])
+NAMES = [name for name in PROGRAMS if name != "fit"]
 
 
+# Several programs in each process, as a process takes longer to start than most of them.
 @pytest.mark.slow
-@pytest.mark.parametrize("program", [name for name in PROGRAMS if name != "fit"])
+@pytest.mark.parametrize("programs", [NAMES[start::3] for start in range(3)], ids="; ".join)
 @pytest.mark.parametrize("threads", [1, 2, 4])
-def test_a_program_ends(program, threads):
-    run([program], threads=threads)
+def test_programs_end(programs, threads):
+    run(programs, threads=threads, limit=900)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("program", ["gradients on devices", "gradient, mean"])
-def test_devices_of_one_cpu_do_not_wait_for_each_other(program):
-    run([program], devices=2)
+def test_devices_of_one_cpu_do_not_wait_for_each_other():
+    run(["gradients on devices", "gradient, mean"], devices=2)
 
 
 @pytest.mark.slow
