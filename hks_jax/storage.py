@@ -1,4 +1,4 @@
-"""Atomic writing of files, exclusive work by one process, errors for damaged files, and NumPy's file formats."""
+"""Atomic writing of files, errors for damaged files, and NumPy's file formats."""
 
 import gzip
 import io
@@ -10,15 +10,10 @@ import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.lib import format as npy
-
-try:
-    import fcntl
-except ImportError:  # on Windows
-    fcntl = None  # type: ignore[assignment]
 
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 
@@ -88,50 +83,6 @@ def atomic_folder(path: str | os.PathLike[str], stale: Callable[[], Iterable[Pat
             for folder in absent:  # innermost first
                 with suppress(OSError):
                     folder.rmdir()
-
-
-@contextmanager
-def claim(path: str | os.PathLike[str]) -> Iterator[bool]:
-    """Lock the file at `path`; yield True if the lock gives this process exclusive access to a piece of work.
-
-    At the end, the file is removed, and so is its folder if it is empty. If the process dies, the operating system
-    releases the lock, but the file remains. An unlocked file thus shows that a process began the work and did not
-    finish it. On Windows and on some network drives, files cannot be locked, and every process gets access.
-    """
-    file = Path(path)
-    held = _hold(file)
-    if held is None:
-        yield False
-        return
-    with held:
-        try:
-            yield True
-        finally:
-            file.unlink(missing_ok=True)
-            with suppress(OSError):  # if the folder has other files
-                file.parent.rmdir()
-
-
-def _hold(file: Path) -> IO[str] | None:
-    """Return the open and locked file, or None if another process has locked it."""
-    while True:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        # The caller closes the file. Between any two of these steps, another process may finish its work and remove the
-        # file and its folder.
-        with suppress(FileNotFoundError):
-            held = open(file, "a", encoding="utf-8")  # noqa: SIM115
-            try:
-                if fcntl is not None:
-                    fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                held.close()
-                return None
-            except OSError:  # a drive without locks
-                pass
-            with suppress(FileNotFoundError):
-                if os.path.samestat(os.fstat(held.fileno()), file.stat()):
-                    return held
-            held.close()
 
 
 def existing(path: str | os.PathLike[str]) -> Path:

@@ -17,7 +17,7 @@ SOURCES = (
     "mkdocs.yml",
     "references.bib",
     ".ci/run",
-    *("docs", "notebooks", "tests", "benchmarks", "hks_jax"),
+    *("containers", "docs", "notebooks", "tests", "benchmarks", "hks_jax"),
 )
 NO_SOURCES = {".pyc", ".part"}
 

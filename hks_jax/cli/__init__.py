@@ -6,6 +6,7 @@ examples:
   hks-jax hks tensor.nii.gz -o out --mask mask.nii.gz --slice z=14 --metric inverse
   hks-jax modes tensor.nii.gz -o out --operator fick --map bold.nii.gz
   hks-jax batch subjects.tsv -o study --metric inverse --atlas atlas.nii.gz
+  hks-jax bids derivatives/qsirecon out participant --participant-label 01 --metric inverse
   hks-jax hks --help
 """
 
@@ -33,12 +34,12 @@ from hks_jax.cli.inputs import require_inputs_kept
 from hks_jax.cli.options import COLUMNS, FILES, add_common, of_arguments
 from hks_jax.cli.outputs import show
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.study import batch
+from hks_jax.cli.study import batch, bids
 from hks_jax.io.formats import WRITTEN
 from hks_jax.io.mesh import READ as MESHES
 from hks_jax.naming import named_as_options, with_option
 
-COMMANDS = (hks, modes, smooth, spectrum, curvature, fit, batch, stats, plot, explore, info, convert, demo)
+COMMANDS = (hks, modes, smooth, spectrum, curvature, fit, batch, bids, stats, plot, explore, info, convert, demo)
 """A module for each command: its docstring is the help text, `add_options` adds its options, and `run` runs it.
 
 `USAGE` has the required arguments. The function `writes` of commands with input files returns the files that the
@@ -94,8 +95,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code: 0 success, 1 failed computation, 2 bad input, 130 interrupt.
 
     Results are written atomically and together at the end, so a failed command writes no file, except for the files of
-    `batch`, the checkpoint of `fit` and the eigenpairs of `hks`. Pictures are drawn after the results are written. No
-    command replaces its input.
+    `batch` and `bids`, the checkpoint of `fit` and the eigenpairs of `hks`. Pictures are drawn after the results are
+    written. No command replaces its input.
     """
     argv, parser = sys.argv[1:] if argv is None else argv, build_parser()
     if not argv:

@@ -8,6 +8,7 @@ import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, TextIO
 
 from hks_jax.naming import with_option
@@ -152,27 +153,34 @@ class StudyProgress(Progress):
 
     On a terminal, one line shows a bar and the stages of the current subject. Elsewhere, such as in a log file, one
     line is printed when a subject begins and one when it ends. A warning begins with the subject's name, and is stored
-    in the subject's sidecar.
+    in the subject's sidecar and log.
     """
 
     _LINE_END = "\r\x1b[K"
 
     def __init__(self, total: int, quiet: bool = False, stream: TextIO | io.StringIO | None = None) -> None:
         super().__init__(quiet, stream)
-        self.total, self.ended, self._spent = total, 0, 0.0
+        self.total, self.ended, self._spent, self._begun = total, 0, 0.0, self.start
+        self._log: TextIO | None = None
 
     @contextmanager
-    def subject(self, name: str) -> Iterator[None]:
-        """Attribute warnings in the body to a subject, and use its time to estimate the time of other subjects."""
+    def subject(self, name: str, log: Path) -> Iterator[None]:
+        """Attribute warnings in the body to a subject, and use its time to estimate the time of other subjects.
+
+        The file `log` has all stages, notes and warnings of the subject's last computation.
+        """
         begun = self._begun = time.perf_counter()
         self._subject, self._stage, self._text, self.warnings = name, "", "", []
         if self._on_terminal:
             self._draw()
         else:
             super().note(f"{self.line()}: {name}")
+        log.parent.mkdir(parents=True, exist_ok=True)
         try:
-            yield
+            with open(log, "w", encoding="utf-8", errors="backslashreplace") as self._log:
+                yield
         finally:
+            self._log = None
             self._spent += time.perf_counter() - begun
             self.ended += 1
             self._subject = ""
@@ -186,8 +194,24 @@ class StudyProgress(Progress):
         left = self._spent / self.ended * (self.total - self.ended) - begun
         return f"{text}, about {duration(max(left, 0.0))} left"
 
+    @contextmanager
+    def stage(self, name: str, detail: str = "") -> Iterator[None]:
+        """Announce a stage and measure its time."""
+        if self._on_terminal:  # where the stage is drawn, and not noted
+            self.note(f"{name}: {detail}" if detail else name)
+        with super().stage(name, detail):
+            yield
+
     def note(self, text: str) -> None:
-        """Print nothing, because the sidecar of a subject contains all notes."""
+        """Write a text that is not a warning to the subject's log."""
+        if self._log is not None:
+            print(f"[{time.perf_counter() - self._begun:7.1f} s] {text}", file=self._log, flush=True)
+
+    def warn(self, message: str) -> None:
+        """Print a warning, unless it was printed before, and write it to the subject's log."""
+        if message not in self.warnings:
+            self.note(f"warning: {message}")
+        super().warn(message)
 
     def end(self, text: str) -> None:
         """Print the result of a subject or of the study."""

@@ -22,7 +22,7 @@ from hks_jax.io.masks import mask_on
 from hks_jax.io.repair import Repair, repair_tensors
 from hks_jax.io.tables import write_json
 from hks_jax.io.tensor_order import Frame, Order
-from hks_jax.io.units import Unit, in_mm2_per_s
+from hks_jax.io.units import Unit
 from hks_jax.io.volume import TensorVolume, describe, digest
 from hks_jax.io.vtk_image import by_time
 from hks_jax.storage import atomic_path, write_npz
@@ -51,8 +51,8 @@ def read_tensors(
     are converted to mm, and a note reports the conversion.
 
     - NIfTI: an image (nx, ny, nz, 1, 6) or (nx, ny, nz, 6). The symmetric-matrix intent (code 1005) or a BIDS sidecar
-      declares the order, and the sidecar may declare the frame. The tensors may also be in six images of one component
-      each; pass the path of one image, or the paths of all six.
+      declares the order, and the sidecar may declare the frame and the unit. The tensors may also be in six images of
+      one component each; pass the path of one image, or the paths of all six.
     - MRtrix: an image (nx, ny, nz, 6), as dwi2tensor writes it.
     - NRRD: an image with tensor components along any axis. The axis of the components has one of NRRD's 2D or 3D matrix
       kinds, or six entries (three for 2×2 tensors) in the given `order`. The measurement frame is applied. If the
@@ -79,7 +79,8 @@ def read_tensors(
         repair: the repair of tensors inside the mask that are not positive definite; see `repair_tensors`. None leaves
             all tensors unchanged, but `hks_jax.TensorField` requires positive definite tensors.
         unit: the unit of the tensors in the file, ``"mm2/s"``, ``"um2/ms"`` (10⁻³ mm²/s), ``"um2/s"``, ``"cm2/s"`` or
-            ``"m2/s"``, which is converted to mm²/s. If `unit` is None, the numbers stay unchanged.
+            ``"m2/s"``, which is converted to mm²/s. If `unit` is None, a NIfTI file's BIDS sidecar may declare the unit
+            (``Units``, such as ``"mm^2/s"``); without a declared unit, the numbers stay unchanged.
 
     Returns:
         The tensors along the voxel axes; `questions` reports a frame or a unit that looks wrong.
@@ -112,8 +113,7 @@ def read_tensors(
         volume = reader.read_tensors(name, order, frame, **{option: given[option] for option in reader.options})
         if not name.lower().endswith(".nhdr"):  # the digest of a detached header would not identify the data
             volume = replace(volume, digest=digest(name))
-    if unit is not None:
-        volume = in_mm2_per_s(volume, unit)
+    volume = nifti.with_units(volume, paths[0], unit)
     if mask is not None:
         volume = volume.with_mask(mask_on(volume.shape, volume.affine, mask))
     return volume if repair is None else repair_tensors(volume, repair)
@@ -132,7 +132,7 @@ def save(
 
     - ``.nii``, ``.nii.gz``: an image with the volume's affine and times along the fourth axis. A slice is written as
       an image one voxel thick at its position in space. NaN outside the mask is kept. Times in `extra` are written to
-      NAME.json beside the image as ``Times``, following BIDS.
+      NAME.json beside the image as ``Times``, following BIDS, with the ``OrientationEncoding`` of scalars.
     - ``.nrrd``: the same image with times along the last axis, and `extra` as text in the header.
     - ``.vti``: point data with ``mask`` and one array per time, whose name contains the time; field data with `extra`.
     - ``.npz``: the values as the array `name`, and the arrays in `extra`. For a volume or slice, the npz also contains

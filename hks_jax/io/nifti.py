@@ -16,7 +16,7 @@ from hks_jax.io.plausibility import undeclared_frame
 from hks_jax.io.repair import require_symmetric
 from hks_jax.io.tables import write_json
 from hks_jax.io.tensor_order import FRAMES, ORDERS, matrices, pack
-from hks_jax.io.units import by_axis
+from hks_jax.io.units import UNITS, Unit, by_axis, in_mm2_per_s, unit_in
 from hks_jax.io.volume import AXES, Format, TensorVolume, corners, describe_tensors, images_of, own_record, placed
 from hks_jax.naming import argument
 from hks_jax.optional import optional
@@ -31,6 +31,9 @@ _LENGTHS = {0: ("", 1.0), 1: ("m", 1e3), 2: ("mm", 1.0), 3: ("um", 1e-3)}
 """The unit of length for each code in NIfTI's xyzt_units, and its size in mm. Code 0, no unit, is read as mm."""
 _HEADERS_OF_2 = (b"\x1c\x02\0\0", b"\0\0\x02\x1c")
 """The first bytes of NIfTI-2, the size of its header in both byte orders."""
+SCALAR = {"Type": "scalar"}
+"""The entry OrientationEncoding that the draft of BIDS for diffusion derivatives (BIDS Extension Proposal 16) requires
+for images of more than three dimensions, here if the fourth axis has times, and not directions."""
 _REFERENCES = {"ijk": "voxel", "bvec": "fsl", "xyz": "world", "scanner": "world"}
 """The frame for each value of Reference in BIDS's field OrientationEncoding, including values from drafts of BIDS."""
 _COMPONENT = re.compile(r"(?:^|[_.-])(?:dt|t|d)?(xx|xy|xz|yy|yz|zz)(?=[_.])", re.IGNORECASE)
@@ -104,22 +107,47 @@ def sidecar_of(path: str | os.PathLike[str]) -> Path:
     return Path(os.fspath(path).removesuffix(".gz")).with_suffix(".json")
 
 
-def _encoding(path: str) -> dict[str, Any]:
-    """Return the field OrientationEncoding of an image's sidecar, or an empty dictionary."""
+def _in_sidecar(path: str) -> dict[str, Any]:
+    """Return the content of an image's sidecar, or an empty dictionary."""
     sidecar = sidecar_of(path)
     if not sidecar.is_file():
         return {}
     with reading(sidecar, "a BIDS sidecar in JSON"):
         content = json.loads(sidecar.read_text(encoding="utf-8"))
-    encoding = content.get("OrientationEncoding") if isinstance(content, dict) else None
+    return content if isinstance(content, dict) else {}
+
+
+def _encoding(path: str) -> dict[str, Any]:
+    """Return the field OrientationEncoding of an image's sidecar, or an empty dictionary."""
+    encoding = _in_sidecar(path).get("OrientationEncoding")
     if not isinstance(encoding, dict):
         return {}
     reference = encoding.get("Reference")
     if reference is not None and not (isinstance(reference, str) and reference in _REFERENCES):
         raise ValueError(
-            f"{sidecar}: got the Reference {reference!r}; expected one of {', '.join(_REFERENCES)}. Edit or remove it"
+            f"{sidecar_of(path)}: got the Reference {reference!r}; expected one of {', '.join(_REFERENCES)}. Edit or "
+            "remove it"
         )
     return encoding
+
+
+def with_units(volume: TensorVolume, path: str, unit: Unit | None) -> TensorVolume:
+    """Return a volume in mm²/s if its image's sidecar declares its unit; `unit` overrides the sidecar.
+
+    The sidecar may describe an earlier image of the same name, so the unit in the image's own record counts first.
+    """
+    text = _in_sidecar(path).get("Units") if is_nifti(path) and not volume.unit else None
+    if not isinstance(text, str):
+        return volume if unit is None else in_mm2_per_s(volume, unit)
+    declared = unit_in(text)
+    if declared is not None and unit in (None, declared):
+        return in_mm2_per_s(volume, declared, "which the sidecar declares")
+    if unit is None:
+        note = f"the Units {text!r} of the sidecar are ignored; known are {', '.join(UNITS)}"
+    else:
+        volume = in_mm2_per_s(volume, unit)
+        note = f"the unit of the tensors is {unit}, as asked; the sidecar declares {text!r}"
+    return replace(volume, notes=(*volume.notes, note))
 
 
 def _own_record(image: Any, affine: np.ndarray) -> dict[str, Any]:
@@ -258,7 +286,8 @@ def _write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra
         raise ValueError(f"extra: got {', '.join(others)}; expected only times for NIfTI. Write an .npz as well")
     if "times" in extra:
         sources = [Path(volume.source).name] if volume.source else []
-        about = {"Quantity": name, "Times": np.ravel(extra["times"]).tolist(), "Sources": sources}
+        times = np.ravel(extra["times"]).tolist()
+        about = {"Quantity": name, "Times": times, "Sources": sources, "OrientationEncoding": SCALAR}
         settings = json.loads(record).get("settings")
         write_json(sidecar_of(path), about | ({"Settings": settings} if settings else {}))
     image = optional("nibabel").Nifti1Image(images_of(array, volume), volume.volume_affine)

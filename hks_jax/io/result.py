@@ -253,6 +253,15 @@ class Result:
         return unit_of_times(self.place, "inverse" if self.in_time else self.settings.get("metric"))
 
     @property
+    def unit_of_values(self) -> str:
+        """The unit of a signature, ``"1"`` if it has none; empty if it is not known."""
+        if self.normalisation in ("flat", "volume"):
+            return "1"
+        if self.settings.get("operator") == "fick":
+            return f"{self.length_unit}^-{self.dimension}" if self.length_unit else ""
+        return f"s^-{self.dimension / 2:g}" if self.unit == "s" else ""
+
+    @property
     def units(self) -> dict[str, Any]:
         """Facts for reports: the units of t and of √(Dt), and the diffusivity D with its definition."""
         return {

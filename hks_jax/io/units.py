@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -50,8 +50,15 @@ def by_axis(values: Iterable[float]) -> str:
     return " × ".join(f"{value:.5g}" for value in values)
 
 
-def in_mm2_per_s(volume: TensorVolume, unit: Unit) -> TensorVolume:
-    """Return the volume with its tensors converted from `unit` to mm²/s."""
+def unit_in(text: str) -> Unit | None:
+    """Return the unit of diffusivity that a text names, such as ``mm^2/s`` or ``µm²·ms⁻¹``; None for other texts."""
+    word = text.strip().lower().translate(str.maketrans("\u00b5\u03bc²⁻¹·*", "uu2-1..", "^ "))
+    word = re.sub(r"\.*(ms|s)-1$", r"/\1", word)
+    return next((unit for unit in get_args(Unit) if unit == word), None)
+
+
+def in_mm2_per_s(volume: TensorVolume, unit: Unit, why: str = "as asked") -> TensorVolume:
+    """Return the volume with its tensors converted from `unit` to mm²/s; a note says why they have this unit."""
     if unit not in UNITS:
         raise ValueError(f"unit: got {unit!r}; expected one of {', '.join(UNITS)}")
     if volume.unit:
@@ -59,7 +66,7 @@ def in_mm2_per_s(volume: TensorVolume, unit: Unit) -> TensorVolume:
     scale = UNITS[unit]
     if scale == 1:
         return replace(volume, unit=MM2_PER_S)
-    note = f"tensors multiplied by {scale:g} to convert them from {unit}, as asked, to {MM2_PER_S}"
+    note = f"tensors multiplied by {scale:g} to convert them from {unit}, {why}, to {MM2_PER_S}"
     return replace(volume, tensors=volume.tensors * scale, unit=MM2_PER_S, notes=(*volume.notes, note))
 
 

@@ -1,7 +1,6 @@
 """Studies: regions' statistics, six images of components, and many subjects that are computed, killed and resumed."""
 
 import argparse
-import contextlib
 import csv
 import importlib.util
 import io
@@ -24,8 +23,8 @@ from hks_jax.cli import build_parser, main
 from hks_jax.cli.computation import Settings
 from hks_jax.cli.options import defaults
 from hks_jax.cli.progress import StudyProgress
-from hks_jax.cli.study.batch import Range, add_kept, common_times, suitable_range
 from hks_jax.cli.study.folder import Study
+from hks_jax.cli.study.settings import Range, add_kept, common_times, suitable_range
 from hks_jax.cli.study.subjects import read_subjects
 from hks_jax.cli.study.tasks import Outcome
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
@@ -34,7 +33,6 @@ from hks_jax.io.nifti import component_of
 from hks_jax.io.pairs import pairs_of
 from hks_jax.io.result import Result
 from hks_jax.io.tables import read_table, write_table
-from hks_jax.storage import claim
 
 ROOT = Path(__file__).resolve().parents[2]
 BRAINS = ROOT.parent / "shared" / "data"
@@ -219,7 +217,9 @@ def command(study, out, *more):
 
 
 def contents(folder):
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    """The bytes of all files but the logs, which have durations."""
+    files = [path for path in folder.rglob("*") if path.is_file() and path.parent.name != "logs"]
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
 LAMBDA1 = ("--times", "2", "5", "--time-unit", "lambda1", "--normalisation", "volume")
@@ -245,9 +245,8 @@ def test_a_study_that_was_stopped_and_one_that_was_not_have_the_same_bytes(study
         patch.setattr(Study, "write_signature", stop)
         assert main(command(study, "stopped", *LAMBDA1, "-q")) == 130
     assert not (study / "stopped" / "group_regions.tsv").exists()
-    (study / "stopped" / "sub-02" / ".attempt").touch()  # as it is after a crash: then it is the last
     capsys.readouterr()
-    assert main(command(study, "stopped", *LAMBDA1)) == 0
+    assert main(command(study, "stopped", *LAMBDA1)) == 0  # the subject without an end is the last
     printed = capsys.readouterr().err
     assert "1 of 3 subjects are already done" in printed
     assert printed.index("0 of 2: sub-03") < printed.index("1 of 2, ") < printed.index(": sub-02")
@@ -285,11 +284,21 @@ def test_a_study_is_a_bids_derivative(study, monkeypatch):
     out = study / "out"
     about = json.loads((out / "dataset_description.json").read_text())
     assert (about["DatasetType"], about["GeneratedBy"][0]["Name"]) == ("derivative", "hks-jax")
-    assert [row["group"] for row in table(out / "participants.tsv")] == ["control", "control", "patient"]
-    assert [row["status"] for row in table(out / "group_summary.tsv")] == ["done", "pending", "pending"]
+    assert (out / "logs" / "sub-01.log").read_text().splitlines()[-1] == "done"
+    assert not list(out.glob("*.tsv"))  # the command without --only collects
+    lines = (study / "subjects.tsv").read_text().splitlines()
+    (study / "subjects.tsv").write_text("\n".join(lines[:2]))
+    (out / "participants.tsv").write_text("participant_id\tgroup\nsub-01\told\nsub-07\tgone\n")
+    with monkeypatch.context() as patch:
+        patch.setattr("hks_jax.cli.study.tasks._compute", None)
+        assert main([*command(study, "out", "--times", "3e3"), "-q"]) == 0
+    assert table(out / "participants.tsv") == [{"participant_id": "sub-01", "group": "control"}]
+    assert [row["status"] for row in table(out / "group_summary.tsv")] == ["done"]
     stem = out / "sub-01" / "dwi" / "sub-01_model-tensor_param-hks_dwimap"
     sidecar = json.loads(stem.with_suffix(".json").read_text())
     assert (sidecar["Times"], sidecar["Sources"]) == ([3000.0], ["t1.nii.gz"])
+    assert (sidecar["OrientationEncoding"], sidecar["Units"]) == ({"Type": "scalar"}, "1")
+    assert set(sidecar["SHA256"]) == {f"{stem.name}.nii.gz", f"{stem.name}.npz"}
     image = nib.load(stem.with_suffix(".nii.gz"))
     assert image.shape == (9, 8, 1, 1)
     assert (out / "sub-01" / "figures" / f"{stem.name}.png").is_file()
@@ -305,9 +314,10 @@ def test_a_study_is_a_bids_derivative(study, monkeypatch):
 
     # The regions of a signature that is computed again without labels are gone.
     assert (out / "group_regions.tsv").is_file()
-    words = command(study, "out", "--times", "3e3", "--only", "sub-01", "--replace", "--normalisation", "raw", "-q")
+    words = command(study, "out", "--times", "3e3", "--replace", "--normalisation", "raw", "-q")
     assert main([word for word in words if word not in ("--atlas", str(atlas))]) == 0
     assert not list(out.rglob("*regions*"))
+    assert json.loads(stem.with_suffix(".json").read_text())["Units"] == "s^-1"
 
 
 def test_one_bad_subject_does_not_stop_the_others(study, monkeypatch, capsys):
@@ -391,6 +401,27 @@ def test_a_subject_is_done_again_when_its_sidecar_changes(study):
     assert [a == b for a, b in zip(before, after, strict=True)] == [False, False, True]
 
 
+def test_a_damaged_or_foreign_result_is_computed_again_and_said(study, monkeypatch, capsys):
+    monkeypatch.setattr(
+        "hks_jax.cli.study.tasks.signature_panels", lambda result, path, **_: path.write_text("picture")
+    )
+    words = command(study, "out", "--times", "3e3", "--only", "sub-01", "sub-03")
+    assert main(words) == 0
+    before = contents(study / "out")
+    stem = "sub-{0}/dwi/sub-{0}_model-tensor_param-hks"
+    first, third = (study / "out" / f"{stem.format(one)}_dwimap.npz" for one in ("01", "03"))
+    first.write_bytes(first.read_bytes()[:-1])  # damaged
+    third.write_bytes(before[f"{stem.format('01')}_dwimap.npz"])  # of another subject
+    table_of_3 = study / "out" / f"{stem.format('03')}_regions.tsv"
+    table_of_3.write_text(table_of_3.read_text().replace("left", "LEFT"))
+    capsys.readouterr()
+    assert main(words) == 0
+    printed = capsys.readouterr().err
+    assert f"sub-01 is computed again: {first} is damaged: its SHA-256 is not that of the sidecar" in printed
+    assert f"sub-03 is computed again: {third} is damaged" in printed
+    assert contents(study / "out") == before
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -463,7 +494,8 @@ def test_automatic_times_follow_the_metric_and_remain_those_of_the_study(study, 
         return json.loads((study / "out" / "study.json").read_text())["times"]
 
     monkeypatch.setattr("hks_jax.cli.study.tasks.run_all", lambda *_: Outcome({}, []))
-    monkeypatch.setattr(Study, "write_group", lambda *_: [])
+    monkeypatch.setattr("hks_jax.cli.study.tasks.write_group", lambda *_: [])
+    monkeypatch.setattr("hks_jax.cli.study.tasks.other_units", lambda *_: {})
     save_tensors(study / "t3.nii.gz", volume(0.9))
     first = times()
     with open(study / "subjects.tsv", "a") as stream:
@@ -483,23 +515,23 @@ def test_automatic_times_follow_the_metric_and_remain_those_of_the_study(study, 
     assert times("--replace", *other)[0] > first[0]  # chosen anew, of all subjects
 
 
-def test_progress_says_how_long_the_others_take(capsys, monkeypatch):
+def test_progress_says_how_long_the_others_take(tmp_path, capsys, monkeypatch):
     clock = [0.0]
     monkeypatch.setattr("time.perf_counter", lambda: clock[0])
     progress = StudyProgress(4)
     for seconds in (60, 120):
-        with progress.subject("sub-01"):
+        with progress.subject("sub-01", tmp_path / "log"):
             clock[0] += seconds
     assert progress.line() == "[##########..........] 2 of 4, about 3 min left"
     assert "1 of 4, about 3 min left: sub-01" in capsys.readouterr().err
 
 
-def test_on_a_terminal_the_bar_stays_in_its_line():
+def test_on_a_terminal_the_bar_stays_in_its_line(tmp_path):
     stream = io.StringIO()
     stream.isatty = lambda: True
     progress = StudyProgress(2)
     progress.stream = stream
-    with progress.subject("sub-01"), progress.stage("eigenpairs"):
+    with progress.subject("sub-01", tmp_path / "log"), progress.stage("eigenpairs"):
         progress.update("3 of 8 pairs")
         progress.warn("it is too coarse")
     progress.end("done")
@@ -507,41 +539,8 @@ def test_on_a_terminal_the_bar_stays_in_its_line():
     assert re.findall(r"\n", text) == ["\n"] * 2
     assert "\r\x1b[Kwarning: sub-01: it is too coarse\n" in text
     assert "\r[....................] 0 of 2: sub-01: eigenpairs, 3 of 8 pairs\x1b[K" in text
-
-
-@pytest.mark.slow
-def test_processes_share_a_study(study, capsys):
-    """Two at once: each subject is computed by one of them, and both end with the whole study, as one alone does."""
-    given = command(study, "shared", *LAMBDA1)
-    start = [sys.executable, "-m", "hks_jax", *given]
-    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
-    both = [subprocess.Popen(start, env=environment, stderr=subprocess.PIPE, text=True) for _ in range(2)]
-    printed = [process.communicate(timeout=300)[1] for process in both]
-    assert [process.returncode for process in both] == [0, 0], printed
-    begun = [name for text in printed for name in re.findall(r"\d of \d(?:, [^:]*)?: (sub-0\d)$", text, re.M)]
-    assert sorted(begun) == ["sub-01", "sub-02", "sub-03"], printed
-    assert all("3 of 3 subjects are done" in text for text in printed)
-    assert main(command(study, "alone", *LAMBDA1, "-q")) == 0
-    assert contents(study / "shared") == contents(study / "alone")
-
-
-def test_a_process_waits_for_what_another_computes(study, monkeypatch, capsys):
-    monkeypatch.setattr(
-        "hks_jax.cli.study.tasks.signature_panels", lambda result, path, **_: path.write_text("picture")
-    )
-    other = study / "out" / "sub-02" / ".attempt"
-    with contextlib.ExitStack() as stack:
-        assert stack.enter_context(claim(other))
-
-        def end_of_the_other(seconds):
-            stack.close()  # it did not come to an end: the subject is ours
-
-        monkeypatch.setattr("hks_jax.cli.study.tasks.time.sleep", end_of_the_other)
-        assert main(command(study, "out", *LAMBDA1)) == 0
-    printed = capsys.readouterr().err
-    assert printed.index(": sub-03") < printed.index("waiting for other processes that compute 1 of the subjects")
-    assert printed.index("waiting for") < printed.index(": sub-02")
-    assert not other.exists()
+    logged = [line.partition("] ")[2] for line in (tmp_path / "log").read_text().splitlines()]
+    assert logged == ["eigenpairs", "warning: it is too coarse"]
 
 
 def test_a_study_that_another_process_begins_anew_is_left_to_it(study, monkeypatch, capsys):
@@ -560,22 +559,6 @@ def test_a_study_that_another_process_begins_anew_is_left_to_it(study, monkeypat
     printed = capsys.readouterr().err
     assert "another process has meanwhile changed" in printed
     assert "sub-02" not in printed
-
-
-@pytest.mark.slow
-def test_a_claim_is_free_again_when_its_process_dies(tmp_path):
-    file = tmp_path / "deep" / "claim"
-    code = f"from hks_jax.storage import claim\nwith claim({str(file)!r}): print('mine', flush=True); input()"
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    with subprocess.Popen([sys.executable, "-c", code], **pipes) as process:
-        assert process.stdout.readline() == "mine\n"
-        with claim(file) as ours:
-            assert not ours
-        process.kill()
-    assert file.exists()
-    with claim(file) as ours, claim(file) as again:
-        assert (ours, again) == (True, False)
-    assert not file.parent.exists()
 
 
 @pytest.mark.slow
@@ -630,7 +613,8 @@ def test_a_study_keeps_the_boundary_that_it_began_with(study, monkeypatch, capsy
         return json.loads((study / out / "study.json").read_text())["settings"]["boundary"]
 
     monkeypatch.setattr("hks_jax.cli.study.tasks.run_all", lambda *_: Outcome({}, []))
-    monkeypatch.setattr(Study, "write_group", lambda *_: [])
+    monkeypatch.setattr("hks_jax.cli.study.tasks.write_group", lambda *_: [])
+    monkeypatch.setattr("hks_jax.cli.study.tasks.other_units", lambda *_: {})
     assert boundary("new") == "mean"
     assert "options for all subjects: --boundary mean\n" in capsys.readouterr().err
     assert boundary("old", "--boundary", "neumann:dirichlet,neumann") == [["neumann", "dirichlet"], "neumann"]
@@ -642,7 +626,8 @@ def test_a_study_keeps_the_boundary_that_it_began_with(study, monkeypatch, capsy
 
 def test_omitted_options_are_those_of_the_study(study, monkeypatch, capsys):
     monkeypatch.setattr("hks_jax.cli.study.tasks.run_all", lambda *_: Outcome({}, []))
-    monkeypatch.setattr(Study, "write_group", lambda *_: [])
+    monkeypatch.setattr("hks_jax.cli.study.tasks.write_group", lambda *_: [])
+    monkeypatch.setattr("hks_jax.cli.study.tasks.other_units", lambda *_: {})
     kept = ["--normalisation", "raw", "--repair", "clip:1e-4", "--times", "3e3", "6e3", "--time-unit", "lambda1"]
     assert main(command(study, "out", "--erode", "0", *kept)) == 0
     record = (study / "out" / "study.json").read_text()

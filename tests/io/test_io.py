@@ -380,7 +380,8 @@ def test_npz_results(tmp_path, volume):
 
 def test_times_of_an_image_are_beside_it(tmp_path, volume):
     hj.io.save(tmp_path / "v.nii.gz", np.zeros((2, *SHAPE)), volume, name="hks", extra={"times": np.array([1.0, 2.5])})
-    assert json.loads((tmp_path / "v.json").read_text()) == {"Quantity": "hks", "Times": [1.0, 2.5], "Sources": []}
+    about = {"Quantity": "hks", "Times": [1.0, 2.5], "Sources": [], "OrientationEncoding": {"Type": "scalar"}}
+    assert json.loads((tmp_path / "v.json").read_text()) == about
 
 
 def test_results_that_cannot_be_saved(tmp_path, volume):

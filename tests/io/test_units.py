@@ -4,6 +4,7 @@ import json
 import re
 from dataclasses import replace
 
+import derivatives as tree
 import nibabel as nib
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from annotations import unchecked
 from hks_jax.cli import main
 from hks_jax.io import TensorVolume, questions, read_mask, read_tensors, save, save_tensors
 from hks_jax.io.masks import read_labels
-from hks_jax.io.units import b_value_question, millimetres
+from hks_jax.io.units import b_value_question, millimetres, unit_in
 
 SHAPE = (8, 7, 5)
 D = 1e-3 * np.array([[1.2, 0.2, 0.1], [0.2, 0.6, 0.0], [0.1, 0.0, 0.3]])  # mm²/s; its mean diffusivity is 7e-4
@@ -227,3 +228,29 @@ def test_b_values_in_another_unit(largest, unit):
     question = b_value_question(largest, "mm2/s")
     assert (f'pass unit="{unit}"' in question) if unit else question == ""
     assert f'pass unit="{unit or "mm2/s"}"' in b_value_question(largest, "cm2/s" if unit else "um2/s")
+
+
+@pytest.mark.parametrize(
+    ("text", "unit"),
+    [
+        *[("mm^2/s", "mm2/s"), ("µm²·ms⁻¹", "um2/ms"), ("um^2.s^-1", "um2/s"), ("m2 s-1", "m2/s"), ("CM^2/s", "cm2/s")],
+        *[("s", None), ("10^-3 mm^2/s", None), ("", None), ("mm2/ms", None)],
+    ],
+)
+def test_units_of_sidecars_are_understood_in_usual_spellings(text, unit):
+    assert unit_in(text) == unit
+
+
+def test_a_unit_that_is_asked_for_overrides_the_sidecar(tmp_path):
+    path = tree.bep16(tmp_path, "01", scale=1e3, unit="um^2/ms")
+    np.testing.assert_allclose(read_tensors(path).tensors, tree.tensors(), rtol=1e-6, atol=1e-12)
+    assert (read_tensors(path).unit, read_tensors(path, unit="um2/ms").notes) == ("mm²/s", read_tensors(path).notes)
+    assert "tensors multiplied by 0.001 to convert them from um2/ms, which the sidecar declares, to mm²/s" in (
+        read_tensors(path).notes
+    )
+    other = read_tensors(path, unit="um2/s")
+    np.testing.assert_allclose(other.tensors, 1e-3 * tree.tensors(), rtol=1e-6, atol=1e-15)
+    assert "the unit of the tensors is um2/s, as asked; the sidecar declares 'um^2/ms'" in other.notes
+    unknown = read_tensors(tree.bep16(tmp_path, "02", unit="10^-3 mm^2/s"))
+    assert unknown.unit == ""
+    assert any("the Units '10^-3 mm^2/s' of the sidecar are ignored" in note for note in unknown.notes)

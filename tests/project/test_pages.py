@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PYTHON = re.compile(r"```python\n(.*?)```", re.DOTALL)
 # Files of the reader's, and addresses of other machines, are not here.
-NOT_HERE = ("heart.vtu", "lh.white", "dti.nii.gz", "dwi.nii.gz", "jax.distributed.initialize")
+NOT_HERE = ("heart.vtu", "lh.white", "dti.nii.gz", "dwi.nii.gz", "jax.distributed.initialize", "dask.distributed")
 
 
 def blocks(page):

@@ -1,4 +1,4 @@
-"""The folder of a study, a BIDS derivative: file names, sidecars, state of subjects, and tables of the group."""
+"""The folder of a study, a BIDS derivative: file names, sidecars, logs, and the state of subjects."""
 
 import argparse
 import hashlib
@@ -19,8 +19,9 @@ from hks_jax.cli.reading import Reading, is_file
 from hks_jax.cli.study.subjects import Subject
 from hks_jax.io.formats import format_of
 from hks_jax.io.masks import names_beside
+from hks_jax.io.nifti import SCALAR
 from hks_jax.io.result import Result, plain
-from hks_jax.io.tables import read_json, read_table, write_json, write_table
+from hks_jax.io.tables import read_json, write_json
 from hks_jax.io.volume import digest
 from hks_jax.storage import atomic_folder, atomic_path, existing
 
@@ -28,24 +29,16 @@ MAP = "_model-tensor_param-hks_dwimap"
 REGIONS = "_model-tensor_param-hks_regions"
 PAIRS = "_model-tensor_param-hks_pairs.npz"
 """The suffixes of file names: a subject's signature, the table of its regions, and its saved eigenpairs."""
+DONE, FAILED, UNFINISHED = "done", "failed: ", "unfinished"
+"""The last line of a subject's log, if the reason follows `FAILED`; a log without it is that of a killed process."""
+ABSENT = "not computed"
 DESCRIPTIONS = ("study.json", "dataset_description.json", ".bidsignore", "participants.tsv")
 """The names of the files that describe a study."""
-_SUFFIXES = {MAP: ".npz", REGIONS: ".tsv"}
+IGNORED = "study.json\nlogs\nfigures\n*_dwimap.*\n*_regions.*\n*_pairs.npz\ngroup_*\n"
+"""The files that BIDS's validator ignores. It knows no ``dwimap``, which is of a draft (BIDS Extension Proposal 16)."""
 GENERATED_BY = {"Name": "hks-jax", "Version": __version__}
 _TEMPORARY = re.compile(r"\.[0-9a-f]{12}\..+")
 """The names of temporary files that an interrupted process may leave (see `hks_jax.atomic_path`)."""
-SUMMARY = {
-    "status": "done, failed, or pending if the run did not include the subject",
-    "voxels": "number of voxels in the domain",
-    "k": "number of eigenpairs",
-    "lambda1": "first positive eigenvalue in 1/(metric length)²; in 1/s for D in mm²/s with D⁻¹ or Fick's operator",
-    "truncation": "largest share of the signature, over t, from omitted eigenpairs (estimate)",
-    "free_of_rim": "share of voxels, at the last t, at which the boundary contributes less than 10 % of the signature",
-    "resolution": "largest relative error, over t, due to the size of the voxels (estimate)",
-    "warnings": "number of warnings, which the subject's sidecar contains",
-    "problem": "reason why the subject failed",
-}
-"""The columns of the group's summary after the identifiers, with descriptions."""
 
 
 @dataclass(frozen=True)
@@ -68,13 +61,30 @@ class Study:
     save_pairs: bool = False
     files: Mapping[str, str] = field(default_factory=dict)
 
-    def path(self, subject: Subject, ending: str, folder: str = "dwi") -> Path:
+    def path(self, subject: Subject, ending: str) -> Path:
         """Return the path of a subject's file."""
-        return self.folder / subject.folder / folder / f"{subject.name}{ending}"
+        return self.folder / subject.folder / "dwi" / f"{subject.name}{ending}"
+
+    def log(self, subject: Subject) -> Path:
+        """Return the path of the log of a subject's last computation."""
+        return self.folder / "logs" / f"{subject.name}.log"
+
+    def outcome(self, subject: Subject) -> str:
+        """Return the last line of a subject's log: `DONE`, or `FAILED` and the reason, or `UNFINISHED`; or empty."""
+        if not self.log(subject).is_file():
+            return ""
+        last = ["", *self.log(subject).read_text(encoding="utf-8", errors="replace").splitlines()][-1]
+        return last if last == DONE or last.startswith(FAILED) else UNFINISHED
+
+    def log_end(self, subject: Subject, line: str) -> None:
+        """Add the last line to a subject's log."""
+        self.log(subject).parent.mkdir(parents=True, exist_ok=True)
+        with open(self.log(subject), "a", encoding="utf-8", errors="backslashreplace") as stream:
+            print(line, file=stream)
 
     def picture(self, subject: Subject) -> Path:
         """Return the path of the picture of a subject's signature."""
-        return self.path(subject, f"{MAP}.png", "figures")
+        return self.folder / subject.participant / "figures" / f"{subject.name}{MAP}.png"
 
     def fingerprint(self, subject: Subject) -> str:
         """Return a digest of all inputs of a subject's signature; raise FileNotFoundError if a file is missing."""
@@ -95,10 +105,18 @@ class Study:
         files = [None if path is None else digest(existing(path)) for path in paths]
         return _digest({"signature": fingerprint, "files": files})
 
-    def has(self, subject: Subject, kind: str, fingerprint: str) -> bool:
-        """Return whether the signature or the table of regions exists and has this fingerprint."""
-        made_of = read_json(self.path(subject, f"{kind}.json")).get("Fingerprint")
-        return made_of == fingerprint and self.path(subject, kind + _SUFFIXES[kind]).is_file()
+    def lacks(self, subject: Subject, kind: str, fingerprint: str) -> str:
+        """Return why the signature or the table of regions is not complete with this fingerprint; empty if it is."""
+        about = read_json(self.path(subject, f"{kind}.json"))
+        if not about:
+            return ABSENT
+        if about.get("Fingerprint") != fingerprint or "SHA256" not in about:
+            return "computed from other files, with other settings or by another version"
+        for name, stored in about["SHA256"].items():
+            file = self.path(subject, "").with_name(name)
+            if not file.is_file() or digest(file) != stored:
+                return f"{file} is damaged: its SHA-256 is not that of the sidecar"
+        return ""
 
     def write_signature(self, subject: Subject, fingerprint: str, result: Result, warnings: list[str]) -> None:
         """Write a subject's signature and, last, the sidecar that marks completion, all without dates."""
@@ -107,13 +125,16 @@ class Study:
         target = self.path(subject, MAP)
         with atomic_folder(target.parent) as temporary:
             result.save(temporary / target.name, format_of(args.file).image)
+            checksums = {file.name: digest(file) for file in sorted(temporary.iterdir()) if file.suffix != ".json"}
         sidecar = {
             "Description": "Heat kernel signature of the field of diffusion tensors; times along the last axis",
+            "OrientationEncoding": SCALAR,
             "Model": {"Description": "Diffusion tensor", "Parameters": report["settings"]},
             "Times": result.times.tolist(),
             "TimesByFirstEigenvalue": None if scaled is None else scaled.tolist(),
             "TimesDescription": times_text(self.time_unit),
-            "Units": report["units"],
+            **({"Units": result.unit_of_values} if result.unit_of_values else {}),
+            "UnitsOfTimes": report["units"],
             "Rim": report["rim"],
             "Sources": [os.path.basename(path) for paths in Reading.of(args).files.values() for path in paths],
             "Input": _without_folder(report["input"]),
@@ -124,6 +145,7 @@ class Study:
             "Warnings": warnings,
             "GeneratedBy": GENERATED_BY,
             "Fingerprint": fingerprint,
+            "SHA256": checksums,
         }
         write_json(self.path(subject, f"{MAP}.json"), plain(sidecar))
 
@@ -131,10 +153,10 @@ class Study:
         """Remove files of a subject from an interrupted run or from a run with other settings."""
         sidecar, picture = self.path(subject, f"{MAP}.json"), self.picture(subject)
         sidecar.unlink(missing_ok=True)  # first, because a sidecar means that the other files are complete
-        ours = [file for kind in _SUFFIXES for file in sidecar.parent.glob(f"{subject.name}{kind}.*")]
+        ours = [file for kind in (MAP, REGIONS) for file in sidecar.parent.glob(f"{subject.name}{kind}.*")]
         for path in [*ours, picture, sidecar.with_name("explore.html")]:
             path.unlink(missing_ok=True)
-        for folder in (sidecar.parent.parent, sidecar.parent, picture.parent):
+        for folder in (sidecar.parent, picture.parent):
             for left in folder.glob(".*") if folder.is_dir() else ():
                 if _TEMPORARY.fullmatch(left.name):
                     shutil.rmtree(left) if left.is_dir() else left.unlink()
@@ -156,7 +178,7 @@ class Study:
                 "Choose another folder for one of the studies"
             )
 
-    def write_description(self, subjects: list[Subject], chosen: str) -> None:
+    def write_description(self, chosen: str) -> None:
         """Write the files that describe the study: the description of a BIDS derivative, and study.json with times."""
         description = {
             "Name": "Heat kernel signatures of diffusion tensor fields",
@@ -166,37 +188,15 @@ class Study:
         }
         write_json(self.folder / "dataset_description.json", description)
         with atomic_path(self.folder / ".bidsignore") as temporary:
-            temporary.write_text("study.json\ngroup_*\n*.npz\n*_regions.*\n")
+            temporary.write_text(IGNORED)
         about = {**self.record, "chosen": chosen, "files": self.files, "description": times_text(self.time_unit)}
         write_json(self.folder / "study.json", about)
-        covariates = list(dict.fromkeys(name for subject in subjects for name in subject.covariates))
-        first = {subject.participant: subject.covariates for subject in reversed(subjects)}  # of the first session
-        rows = [(who, *map(first[who].get, covariates)) for who in dict.fromkeys(s.participant for s in subjects)]
-        write_table(self.folder / "participants.tsv", ("participant_id", *covariates), rows)
 
-    def write_group(self, subjects: list[Subject], problems: Mapping[str, str]) -> list[Path]:
-        """Write the tables of all subjects and all regions; `problems` maps names of failed subjects to reasons.
 
-        The regions are those of all subjects that have a table of regions, which belongs to their signature.
-        """
-        n = 1 + any(subject.session for subject in subjects)
-        head, ids = ("participant_id", "session_id")[:n], {s.name: (s.participant, s.session)[:n] for s in subjects}
-        summary = [(*ids[s.name], *_summary(self.path(s, f"{MAP}.json"), problems.get(s.name))) for s in subjects]
-        about = {name: {"Description": text} for name, text in SUMMARY.items()}
-        files = write_table(self.folder / "group_summary.tsv", (*head, *SUMMARY), summary, about)
-        done = [s for s in subjects if s.name not in problems and self.path(s, f"{REGIONS}.json").is_file()]
-        joint = self.folder / "group_regions.tsv"
-        if not done:
-            for old in (joint.with_suffix(".json"), joint):
-                old.unlink(missing_ok=True)
-        else:
-            tables = [(ids[subject.name], read_table(self.path(subject, f"{REGIONS}.tsv"))) for subject in done]
-            columns = list(dict.fromkeys(name for _, rows in tables for row in rows for name in row))
-            joined = [(*who, *map(row.get, columns)) for who, rows in tables for row in rows]
-            about = read_json(self.path(done[0], f"{REGIONS}.json"))
-            described = {name: about[name] for name in (*columns, "Settings") if name in about}
-            files += write_table(joint, (*head, *columns), joined, described)
-        return files
+def written_in(folder: Path) -> list[Path]:
+    """Return the files that a study may write."""
+    names = (*DESCRIPTIONS, "logs/*", "group_*", f"**/*{MAP}*", f"**/*{REGIONS}*", f"**/*{PAIRS}")
+    return [folder / name for name in names]
 
 
 def reading_options(args: argparse.Namespace) -> dict[str, Any]:
@@ -215,17 +215,6 @@ def times_text(unit: str) -> str:
 
 def _without_folder(about: Mapping[str, Any]) -> dict[str, Any]:
     return {**about, "source": os.path.basename(str(about["source"]))}
-
-
-def _summary(sidecar: Path, problem: str | None) -> tuple[Any, ...]:
-    report = {} if problem is not None else read_json(sidecar)
-    if not report:
-        return ("failed" if problem else "pending", *(None,) * 7, problem or None)
-    pairs, times = report["Eigenpairs"], report["Truncation"]
-    worst = [max((t[name] or 0.0 for t in times), default=0.0) for name in ("truncation", "resolution_bias")]
-    inside, warnings = report["Input"]["voxels_inside"], len(report["Warnings"])
-    free = times[-1].get("free_of_rim") if times else None
-    return ("done", inside, pairs["k"], pairs["first_positive"], worst[0], free, worst[1], warnings, None)
 
 
 def _digest(content: Any) -> str:

@@ -1,4 +1,4 @@
-"""Read the table of a study's subjects, whose rows contain files and options for reading them."""
+"""The subjects of a study, and the table from which they are read, whose rows contain files and options."""
 
 import argparse
 import copy
@@ -10,23 +10,22 @@ from typing import NoReturn
 
 from hks_jax.cli.options import COLUMNS, FILES, add_atlas, add_file, add_names, add_noise, add_reading
 from hks_jax.cli.reading import is_file
+from hks_jax.io.bids import format_entities
 from hks_jax.io.tables import read_table
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A row of the table.
+    """The input of one result: a row of the table, or tensors in a BIDS dataset.
 
     Attributes:
-        participant: ``sub-`` and a label.
-        session: ``ses-`` and a label, or the empty text.
-        arguments: the arguments of the command, some replaced by values in the row; None if the row is invalid.
+        entities: the BIDS entities in the names of the result, from ``sub`` on.
+        arguments: the arguments of the command, some replaced by values of the subject; None if these are invalid.
         problem: the error message if the arguments are invalid; otherwise empty.
-        covariates: the columns that are not arguments.
+        covariates: the participant's columns that are not arguments.
     """
 
-    participant: str
-    session: str
+    entities: Mapping[str, str]
     arguments: argparse.Namespace | None
     problem: str = ""
     covariates: Mapping[str, str] = field(default_factory=dict)
@@ -40,13 +39,18 @@ class Subject:
 
     @property
     def name(self) -> str:
-        """The prefix of the subject's file names: ``sub-01`` or ``sub-01_ses-2``."""
-        return "_".join(filter(None, (self.participant, self.session)))
+        """The prefix of the subject's file names, such as ``sub-01`` or ``sub-01_ses-2_run-1``."""
+        return format_entities(self.entities)
+
+    @property
+    def participant(self) -> str:
+        """``sub-`` and the participant's label."""
+        return f"sub-{self.entities['sub']}"
 
     @property
     def folder(self) -> Path:
         """The subject's folder, relative to the folder of the study."""
-        return Path(self.participant, self.session)
+        return Path(*(f"{entity}-{self.entities[entity]}" for entity in ("sub", "ses") if entity in self.entities))
 
 
 class _RowParser(argparse.ArgumentParser):
@@ -70,8 +74,8 @@ def read_subjects(path: Path, common: argparse.Namespace) -> list[Subject]:
     for number, row in enumerate(rows, 2):
         if "participant_id" not in row:
             raise ValueError(f"{path}: got no participant_id in row {number}; expected one in every row")
-        participant = _label(path, "sub", row.pop("participant_id"))
-        session = _label(path, "ses", row.pop("session_id")) if "session_id" in row else ""
+        columns = {"sub": "participant_id", "ses": "session_id"}
+        entities = {e: _label(path, e, row.pop(column)) for e, column in columns.items() if column in row}
         words, covariates = _words(path.parent, row)
         try:
             if not words or words[0].startswith("--"):
@@ -81,7 +85,7 @@ def read_subjects(path: Path, common: argparse.Namespace) -> list[Subject]:
                 arguments.noise = str(path.parent / arguments.noise)
         except ValueError as error:
             arguments, problem = None, str(error)
-        subject = Subject(participant, session, arguments, problem, covariates)
+        subject = Subject(entities, arguments, problem, covariates)
         if subject.name in subjects:
             raise ValueError(f"{path}: got two rows for {subject.name}. Distinguish them by a column named session_id")
         subjects[subject.name] = subject
@@ -92,7 +96,7 @@ def _label(path: Path, entity: str, text: str) -> str:
     label = text.removeprefix(f"{entity}-")
     if not re.fullmatch("[A-Za-z0-9]+", label):
         raise ValueError(f"{path}: got {text!r}; expected {entity}-LABEL or LABEL with only letters and digits (BIDS)")
-    return f"{entity}-{label}"
+    return label
 
 
 def _words(folder: Path, row: dict[str, str]) -> tuple[list[str], dict[str, str]]:

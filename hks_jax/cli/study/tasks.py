@@ -1,41 +1,41 @@
 """Run the computations of a study that are not done yet."""
 
+import argparse
 import io
 import sys
-import time
 import traceback
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import numpy as np
 
 from hks_jax.cli.computation import INPUT_ERRORS, ComputationError, Solved, compute_pairs, domain_of_volume
-from hks_jax.cli.noise import noise_of, signature_of
-from hks_jax.cli.outputs import PictureError, draw_picture
+from hks_jax.cli.inputs import require_inputs_kept
+from hks_jax.cli.noise import check_noise, noise_of, signature_of
+from hks_jax.cli.outputs import Done, PictureError, draw_picture, show
 from hks_jax.cli.pairs import are_of, read_pairs, write_pairs
 from hks_jax.cli.parsing import Times
-from hks_jax.cli.progress import StudyProgress
-from hks_jax.cli.reading import Reading, read_volume
+from hks_jax.cli.progress import Progress, StudyProgress
+from hks_jax.cli.reading import Reading, is_file, read_volume, require_metric
 from hks_jax.cli.stats import region_table
-from hks_jax.cli.study.folder import MAP, PAIRS, REGIONS, Study
+from hks_jax.cli.study.folder import ABSENT, DONE, FAILED, MAP, PAIRS, REGIONS, UNFINISHED, Study
+from hks_jax.cli.study.group import other_units, write_group
+from hks_jax.cli.study.settings import open_study
 from hks_jax.cli.study.subjects import Subject
 from hks_jax.io.formats import format_of
 from hks_jax.io.result import Result
-from hks_jax.io.tables import write_table
+from hks_jax.io.tables import write_json, write_table
+from hks_jax.io.volume import digest
 from hks_jax.plot import signature_panels
 from hks_jax.signatures.times import positive_range
-from hks_jax.storage import claim
 
 FORGETFUL = 8
 """The number of subjects after which compiled programs are deleted; each domain needs 70 MiB of new programs."""
 
 PICTURE = "picture"
-
-PATIENCE = 0.5
-"""The seconds between two checks of subjects that other processes compute."""
 
 
 class Outcome(NamedTuple):
@@ -45,62 +45,155 @@ class Outcome(NamedTuple):
     undrawn: list[str]
 
 
-def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debug: bool) -> Outcome:
-    """Compute all subjects that are not done.
+def run_study(
+    args: argparse.Namespace,
+    chosen: list[Subject],
+    every: Callable[[], list[Subject]],
+    begun: Progress,
+    note: str,
+    collects: bool,
+) -> None:
+    """Compute the chosen subjects that are not done; if some fail, raise ComputationError after the others.
 
-    Several processes may work on the same study; the first process that starts a subject computes it. If another
-    process restarts the study with other settings, this function raises ValueError.
+    `collects` means that the chosen subjects are all, and that the tables of the group are written. The function
+    `every` returns all subjects.
+    """
+    study, progress = _begin(args, chosen, every, begun, note)
+    files = []
+    with progress.catching_warnings():
+        problems, undrawn = run_all(study, chosen, progress, args.debug)
+        if collects:
+            problems |= other_units(study, [subject for subject in chosen if subject.name not in problems])
+            files = write_group(study, chosen, problems)
+    done = [subject for subject in chosen if subject.name not in problems]
+    failed = [subject.name for subject in chosen if subject.name in problems]
+    files += [study.path(subject, f"{MAP}{format_of(subject.args.file).image or '.npz'}") for subject in done]
+    shown = [str(file) for file in files if not collects or file.suffix == ".tsv"]
+    show(args, Done(files, {"failed": failed}, "\n".join(shown)))
+    if failed:
+        raise ComputationError(
+            f"{len(failed)} of {len(chosen)} subjects failed ({_listed(failed)}), the first because: "
+            f"{problems[failed[0]].removeprefix(FAILED)}. The logs in {study.folder / 'logs'} have all reasons. Repeat "
+            "the command to compute the failed subjects again"
+        )
+    if undrawn:
+        raise ComputationError(
+            f"the results are complete, but {len(undrawn)} of {len(chosen)} pictures cannot be drawn "
+            f"({_listed(undrawn)}). Repeat the command to draw them"
+        )
+
+
+def prepare(args: argparse.Namespace, subjects: list[Subject], begun: Progress, note: str) -> None:
+    """Choose the settings and times that suit the subjects, and store them in the study's folder."""
+    study, _ = _begin(args, subjects, lambda: subjects, begun, note)
+    show(args, Done([study.folder / "study.json"], study.record))
+
+
+def collect(args: argparse.Namespace, subjects: list[Subject], begun: Progress, note: str) -> None:
+    """Write the tables of the group from the results that there are; raise ValueError if there are none."""
+    if not (args.output / "study.json").is_file():
+        raise ValueError(f"OUT: there are no results in {args.output}. Compute the participants first")
+    study, progress = _begin(args, subjects, lambda: subjects, begun, note)
+    with progress.catching_warnings():
+        problems = {subject.name: problem for subject in subjects if (problem := _problem(study, subject))}
+        problems |= other_units(study, [subject for subject in subjects if subject.name not in problems])
+        for name, problem in problems.items():
+            progress.warn(f"{name}: {problem}")
+        if len(problems) == len(subjects):
+            first = f"{subjects[0].name}: {problems[subjects[0].name]}"
+            raise ValueError(f"OUT: {study.folder} has none of the {len(subjects)} results. {first}")
+        files = write_group(study, subjects, problems)
+    without = list(problems)
+    show(args, Done(files, {"without": without}, "\n".join(str(file) for file in files if file.suffix == ".tsv")))
+
+
+def _begin(
+    args: argparse.Namespace, chosen: list[Subject], every: Callable[[], list[Subject]], begun: Progress, note: str
+) -> tuple[Study, StudyProgress]:
+    """Check the arguments of the chosen subjects, and open the study."""
+    if is_file(args.noise):
+        why = "for all subjects; expected a number, residuals or roughness"
+        raise ValueError(f"--noise: got {args.noise} {why}. Put second scans into a column named noise of the table")
+    for subject in chosen:
+        if subject.arguments is not None:
+            require_inputs_kept(subject.arguments)
+            require_metric(Reading.of(subject.arguments))
+            check_noise(subject.arguments)
+    progress = StudyProgress(len(chosen), args.quiet)
+    progress.start = begun.start
+    progress.end(note)
+    with progress.catching_warnings():
+        return open_study(args, every, progress), progress
+
+
+def _problem(study: Study, subject: Subject) -> str:
+    """Return why a subject has no result, with `FAILED` before it if the computation failed; empty if it has one."""
+    try:
+        task = _Task.of(study, subject)
+    except Exception as error:
+        return FAILED + _reason(error)
+    lacking = {kind: why for kind, why in task.lacking().items() if kind != PICTURE}
+    last = study.outcome(subject)
+    return last if lacking and last.startswith(FAILED) else next(iter(lacking.values()), "")
+
+
+def _reason(error: Exception) -> str:
+    """Return an error's message in one line, with its type if it is not an error of the input."""
+    known = isinstance(error, (*INPUT_ERRORS, ComputationError, np.linalg.LinAlgError))
+    return " ".join(f"{'' if known else f'{type(error).__name__}: '}{error}".split())
+
+
+def _listed(names: list[str]) -> str:
+    return f"{', '.join(names[:5])}{', …' * (len(names) > 5)}"
+
+
+def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debug: bool) -> Outcome:
+    """Compute all subjects that are not done; another process must not compute the same subjects.
+
+    If another process restarts the study with other settings, this function raises ValueError.
     """
     problems, undrawn = dict[str, str](), list[str]()
 
     def failed(subject: Subject, error: Exception) -> None:
         if debug:
             traceback.print_exception(error, file=sys.stderr)
-        known = isinstance(error, (*INPUT_ERRORS, ComputationError, np.linalg.LinAlgError))
-        problems[subject.name] = " ".join(f"{'' if known else f'{type(error).__name__}: '}{error}".split())
-        progress.end(f"{subject.name} failed: {problems[subject.name]}")
+        problems[subject.name] = FAILED + _reason(error)
+        study.log_end(subject, problems[subject.name])
+        progress.end(f"{subject.name} {problems[subject.name]}")
 
-    plan = []
+    pending = []
     for subject in subjects:
         try:
-            fingerprint = study.fingerprint(subject)
-            regions = "" if subject.args.atlas is None else study.regions_fingerprint(subject, fingerprint)
-            plan.append(_Task(study, subject, fingerprint, regions))
+            task = _Task.of(study, subject)
+            lacking = task.lacking()
         except Exception as error:
             failed(subject, error)
-    pending = [task for task in plan if task.missing]
+            continue
+        if lacking:
+            pending.append((task, lacking))
+        for why in dict.fromkeys(lacking.values()):
+            if why != ABSENT:
+                progress.end(f"{subject.name} is computed again: {why}")
+    if done := len(subjects) - len(problems) - len(pending):
+        progress.end(f"{done} of {len(subjects)} subjects are already done")
     # A subject whose computation killed an earlier process, perhaps by lack of memory, may kill this one: it is last.
-    pending.sort(key=lambda task: task.attempt.exists())
-    if len(pending) < len(plan):
-        progress.end(f"{len(plan) - len(pending)} of {len(subjects)} subjects are already done")
-    progress.total, number, waiting = len(pending), 0, False
-    while pending:
-        elsewhere = []
-        for task in pending:
-            study.require_settings()
-            try:
-                with claim(task.attempt) as ours:
-                    if not ours:
-                        elsewhere.append(task)
-                    elif not task.missing:  # another process has done the task
-                        progress.total -= 1
-                    else:
-                        if number and number % FORGETFUL == 0:
-                            jax.clear_caches()
-                        number += 1
-                        with progress.subject(task.subject.name):
-                            task.run(progress)
-            except PictureError as error:
-                undrawn.append(task.subject.name)
-                progress.end(f"{task.subject.name}: {error}")
-            except Exception as error:
-                failed(task.subject, error)
-        if len(elsewhere) == len(pending):
-            if not waiting:
-                progress.end(f"waiting for other processes that compute {len(elsewhere)} of the subjects")
-            waiting = True
-            time.sleep(PATIENCE)
-        pending = elsewhere
+    pending.sort(key=lambda entry: study.outcome(entry[0].subject) == UNFINISHED)
+    progress.total = len(pending)
+    for number, (task, lacking) in enumerate(pending):
+        study.require_settings()
+        if number and number % FORGETFUL == 0:
+            jax.clear_caches()
+        try:
+            with progress.subject(task.subject.name, study.log(task.subject)):
+                task.run(lacking, progress)
+        except PictureError as error:
+            undrawn.append(task.subject.name)
+            study.log_end(task.subject, DONE)
+            progress.end(f"{task.subject.name}: {error}")
+        except Exception as error:
+            failed(task.subject, error)
+        else:
+            study.log_end(task.subject, DONE)
     progress.end(f"{len(subjects) - len(problems)} of {len(subjects)} subjects are done")
     return Outcome(problems, undrawn)
 
@@ -113,32 +206,37 @@ class _Task(NamedTuple):
     fingerprint: str
     regions: str
 
-    @property
-    def attempt(self) -> Path:
-        """The file that a process locks while it computes a subject; it remains if the process is killed."""
-        return self.study.folder / self.subject.folder / ".attempt"
+    @classmethod
+    def of(cls, study: Study, subject: Subject) -> "_Task":
+        """Return the work on a subject; raise an error if its arguments are invalid or a file is missing."""
+        fingerprint = study.fingerprint(subject)
+        regions = "" if subject.args.atlas is None else study.regions_fingerprint(subject, fingerprint)
+        return cls(study, subject, fingerprint, regions)
 
-    @property
-    def missing(self) -> list[str]:
-        """The results, `MAP` or `REGIONS`, that do not exist or have another fingerprint, and a missing `PICTURE`."""
+    def lacking(self) -> dict[str, str]:
+        """Return why results, `MAP`, `REGIONS` or `PICTURE`, are to be computed."""
         wanted = {MAP: self.fingerprint} | ({REGIONS: self.regions} if self.regions else {})
-        lacking = [kind for kind, fingerprint in wanted.items() if not self.study.has(self.subject, kind, fingerprint)]
-        return lacking if self.study.picture(self.subject).is_file() else [*lacking, PICTURE]
+        found = {kind: self.study.lacks(self.subject, kind, fingerprint) for kind, fingerprint in wanted.items()}
+        found[PICTURE] = "" if self.study.picture(self.subject).is_file() else ABSENT
+        return {kind: why for kind, why in found.items() if why}
 
-    def run(self, progress: StudyProgress) -> None:
-        """Compute what is missing; draw the picture last, so that a failure leaves the results."""
+    def run(self, lacking: Iterable[str], progress: StudyProgress) -> None:
+        """Compute what is lacking; draw the picture last, so that a failure leaves the results."""
         study, subject, result = self.study, self.subject, None
-        if MAP in self.missing:
+        if MAP in lacking:
             result = _compute(study, subject, self.fingerprint, progress)  # removes the picture and table of regions
-        if REGIONS in self.missing:
+            lacking = (REGIONS, PICTURE)
+        if REGIONS in lacking and self.regions:
             table = study.path(subject, f"{REGIONS}.tsv")
             for old in (table.with_suffix(".json"), table):  # the sidecar first, because it marks completion
                 old.unlink(missing_ok=True)
             with progress.stage("regions"):
                 source, args = study.path(subject, f"{MAP}.npz"), subject.args
                 columns, rows, about = region_table(source, args.atlas, args.names, progress)
-                write_table(table, columns, rows, {**about, "Fingerprint": self.regions})
-        if PICTURE in self.missing:
+                write_table(table, columns, rows)
+                checked = {"Fingerprint": self.regions, "SHA256": {table.name: digest(table)}}
+                write_json(table.with_suffix(".json"), {**about, **checked})
+        if PICTURE in lacking:
             npz = study.path(subject, f"{MAP}.npz")
             result = Result.read(npz, "hks", over_times=True) if result is None else result
             with progress.stage("drawing"):
