@@ -67,7 +67,9 @@ def test_a_released_version_has_a_date_and_no_other_has():
 
 
 def test_the_workflows_run_every_target_of_ci_and_exist_in_the_makefile():
-    lists = re.findall(r"^(?:for target in (.*); do|make --jobs.*\" (.*))$", (ROOT / ".ci/run").read_text("utf-8"), re.M)
+    lists = re.findall(
+        r"^(?:for target in (.*); do|make --jobs.*\" (.*))$", (ROOT / ".ci/run").read_text("utf-8"), re.M
+    )
     everything = set(" ".join(map(" ".join, lists)).split()) - {"tools"}  # which only installs
     assert {"test", "lint", "dist"} <= everything
     defined = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE))
