@@ -96,7 +96,7 @@ class _Known(NamedTuple):
 
 
 def _computed(solver: Eigensolver, pencil: Pencil, k: int, report: Report) -> RawPairs:
-    values, vectors, bound = one_by_one(_lowest, (solver, k, report), pencil)
+    values, vectors, bound = one_by_one(_by_solver, (solver, k, report), pencil)
     if pencil.null_space is not None and pencil.n_null:
         values, vectors = _with_null_modes(pencil.mass, pencil.null_space.vectors, values, vectors)
     return values, vectors, bound
@@ -192,7 +192,7 @@ def _tangents(adjoint: Adjoint, on_failure: OnFailure, known: _Known, change: Sy
 
 
 # `one_by_one` needs the same function object in every call; so the next two functions are at module level.
-def _lowest(solver: Eigensolver, k: int, report: Report, pencil: SymmetricPencil) -> RawPairs:
+def _by_solver(solver: Eigensolver, k: int, report: Report, pencil: SymmetricPencil) -> RawPairs:
     return solver.lowest(pencil, k, report)
 
 

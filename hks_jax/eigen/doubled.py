@@ -15,7 +15,7 @@ from hks_jax.arrays import jax_array
 from hks_jax.compilation import numpy_where_known
 from hks_jax.eigen.automatic import choose_solvers
 from hks_jax.eigen.eigenpairs import Eigenpairs, PencilEigenpairs, view
-from hks_jax.eigen.one_pencil import solve_lowest
+from hks_jax.eigen.one_pencil import pairs_of_pencil
 from hks_jax.eigen.solver import Dense, Eigensolver, Report, Status
 from hks_jax.fem.pencil import MirrorPencil
 from hks_jax.traced import is_traced
@@ -150,7 +150,7 @@ def _split(xp: Any, spectra: Any, kept: Any, including: Including, k: int) -> An
     return [xp.arange(size) < xp.sum(kept & (problem == i)) for i, size in enumerate(sizes)]
 
 
-def solve_doubled(
+def pairs_of_doubled(
     pencil: MirrorPencil, solver: str | Eigensolver, k: int, throw: bool, report: Report
 ) -> DoubledEigenpairs:
     """Return the k lowest pairs of a doubled domain, from its problems, each solved for one more eigenvalue.
@@ -169,7 +169,7 @@ def solve_doubled(
         extra = min(1, part.size - wanted[number])
         if limit + extra > own.max_pairs(part.size):  # all pairs of a small problem may be needed
             own = Dense(own.tolerance)
-        return solve_lowest(part, own, wanted[number], extra, throw, report)
+        return pairs_of_pencil(part, own, wanted[number], extra, throw, report)
 
     solved = [solve(i, _of_problem(report, i, len(parts))) for i in range(len(parts))]
     while not traced:

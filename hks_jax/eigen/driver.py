@@ -8,11 +8,11 @@ import numpy as np
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import require_static
 from hks_jax.eigen.automatic import choose_solver
-from hks_jax.eigen.doubled import solve_doubled
+from hks_jax.eigen.doubled import pairs_of_doubled
 from hks_jax.eigen.eigenpairs import RESULTS, Eigenpairs
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
 from hks_jax.eigen.multiplets import SPARE, MultipletChoice
-from hks_jax.eigen.one_pencil import solve_lowest
+from hks_jax.eigen.one_pencil import pairs_of_pencil
 from hks_jax.eigen.shift_invert.shift_invert import ShiftInvert
 from hks_jax.eigen.solver import Eigensolver, Report, silent
 from hks_jax.fem.assembly import MassKind
@@ -92,7 +92,7 @@ def eigenpairs(
             f"k: got {k}; expected an integer from 1 to {total}, the number of degrees of freedom. "
             "Use a smaller k or a finer grid"
         )
-    pairs = _lowest(pencil, int(number), total, solver, multiplet, throw, progress or silent)
+    pairs = _pairs_of(pencil, int(number), total, solver, multiplet, throw, progress or silent)
     known = jax.lax.stop_gradient(pairs)
     if is_traced(known.eigenvalues):
         return known.result.error_if(pairs, known.result != RESULTS.successful) if throw else pairs
@@ -154,7 +154,7 @@ def eigsh(
     return eigenpairs(K if M is None else (K, M), k, solver=solver or "auto", throw=throw, progress=progress)
 
 
-def _lowest(
+def _pairs_of(
     pencil: AnyPencil,
     k: int,
     total: int,
@@ -166,13 +166,13 @@ def _lowest(
     size = min(k + SPARE, total) if multiplet == "complete" else k
     pairs: Eigenpairs
     if isinstance(pencil, MirrorPencil):
-        pairs = solve_doubled(pencil, solver, size, throw, report)
+        pairs = pairs_of_doubled(pencil, solver, size, throw, report)
     else:
         chosen = choose_solver(solver, pencil, size)
         extra = min(1, total - size)  # the next eigenvalue shows whether k cuts a multiple eigenvalue
-        pairs = solve_lowest(pencil, chosen, size, extra, throw, report)
+        pairs = pairs_of_pencil(pencil, chosen, size, extra, throw, report)
         found = jax.lax.stop_gradient(pairs)
         doubtful = solver == "auto" and isinstance(chosen, ShiftInvert) and not pencil.bounded
         if doubtful and (found.unconfirmed or not found.converged.all()):  # for example, if k cuts a large multiplet
-            pairs = solve_lowest(pencil, BlockLanczos(), size, extra, throw, report)
+            pairs = pairs_of_pencil(pencil, BlockLanczos(), size, extra, throw, report)
     return pairs.truncated(k, multiplet)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from hks_jax.arrays import describe_array, jax_array
 from hks_jax.compilation import numpy_where_known
 from hks_jax.domain.tensor_checks import MANY
-from hks_jax.eigen.multiplets import MultipletChoice, Spectrum, is_unconfirmed, lowest, number_cut, numbered
+from hks_jax.eigen.multiplets import MultipletChoice, Spectrum, is_unconfirmed, kept_of, number_cut, numbered
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.rotations import of_simple, with_rotations
 from hks_jax.fem.pencil import AnyPencil, Pencil
@@ -147,7 +147,7 @@ class Eigenpairs(ABC):
         ``"report"`` keeps exactly k. If k cuts a multiple eigenvalue, ``"drop"`` excludes its pairs, unless no pair
         would remain; ``"complete"`` includes all its pairs if they were computed, and otherwise excludes them.
         """
-        return self.keeping(lowest(self._spectrum, k, multiplet))
+        return self.keeping(kept_of(self._spectrum, k, multiplet))
 
     @property
     def eigenfunctions(self) -> Float[Array, "k *shape"]:

@@ -68,7 +68,7 @@ SPARE = 8
 
 
 @numpy_where_known(static_argnums=(1, 2))
-def lowest(xp: Any, spectrum: Spectrum, k: int, multiplet: MultipletChoice) -> Any:
+def kept_of(xp: Any, spectrum: Spectrum, k: int, multiplet: MultipletChoice) -> Any:
     """Return the mask of the lowest k eigenvalues, or of a different number if k cuts a multiple one."""
     size, ends = len(spectrum.values), _ends_of_multiplets(xp, spectrum)
     index = xp.arange(size)

@@ -21,7 +21,7 @@ from hks_jax.linear.host_matrices import balanced, near_zero
 from hks_jax.linear.symmetric_pencil import SymmetricPencil, tabulated
 
 
-def solve_lowest(
+def pairs_of_pencil(
     pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw: bool, report: Report
 ) -> PencilEigenpairs:
     """Return the k lowest pairs and, if ``extra`` = 1, the next eigenvalue. See `solved` for ``throw``."""

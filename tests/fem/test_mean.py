@@ -9,7 +9,7 @@ from scipy.spatial import Delaunay
 
 import hks_jax as hj
 from hks_jax.eigen import doubled
-from hks_jax.eigen.one_pencil import solve_lowest
+from hks_jax.eigen.one_pencil import pairs_of_pencil
 
 RIM_COEFFICIENT = np.sqrt(np.pi) / 4
 """4πt·HKS is 1 + this times κ√t on a rim of curvature κ."""
@@ -234,9 +234,9 @@ def test_each_problem_of_a_doubled_domain_is_solved_once(shape, lengths, monkeyp
 
     def counting(pencil, solver, k, *more):
         sizes.append(k)
-        return solve_lowest(pencil, solver, k, *more)
+        return pairs_of_pencil(pencil, solver, k, *more)
 
-    monkeypatch.setattr(doubled, "solve_lowest", counting)
+    monkeypatch.setattr(doubled, "pairs_of_pencil", counting)
     pairs = hj.eigenpairs(flat(shape, lengths), 120, "mean", "shift-invert", multiplet="drop")
     assert len(sizes) == 2
     assert [each.k for each in pairs.problems] == sizes
