@@ -184,6 +184,7 @@ def test_doubled_domain_with_a_potential(rng, sign):
     assert np.isfinite(slope).all()
 
 
+@pytest.mark.slow
 def test_masks_hide_what_lies_outside(rng):
     mask = np.ones((9, 9), bool)
     mask[:4, :5] = False
@@ -236,7 +237,8 @@ def elasticity(u, v, w):
     return 2 * w["mu"] * jnp.sum(strain * other) + w["lam"] * jnp.trace(u.grad) * jnp.trace(v.grad)
 
 
-@pytest.mark.parametrize("domain", ["grid", pytest.param("tetrahedra", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("domain", ["grid", "tetrahedra"])
 def test_elasticity_agrees_with_scikit_fem_and_has_rigid_modes(rng, domain):
     fields = {"mu": 1.3, "lam": 0.7}
     if domain == "grid":

@@ -44,7 +44,7 @@ for page, code in json.load(sys.stdin).items():
         if jax.config.values[name] != value:
             jax.config.update(name, value)
     os.chdir("..")
-sys.exit(failed and f"pages that fail: {failed}")
+sys.exit(f"pages that fail: {failed}" if failed else 0)
 """
 
 

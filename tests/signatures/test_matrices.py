@@ -96,7 +96,8 @@ def cut(spectrum, least):
     return next(k for k in range(least, len(spectrum)) if spectrum[k] - spectrum[k - 1] > 1e-3 * np.ptp(spectrum[:k]))
 
 
-@pytest.mark.parametrize("name", [n if n == "truss" else pytest.param(n, marks=pytest.mark.slow) for n in PROBLEMS])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PROBLEMS)
 def test_hks_and_its_derivative_by_the_entries(name, rng):
     matrices, zeros = PROBLEMS[name]
     K, M = matrices()

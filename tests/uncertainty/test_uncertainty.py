@@ -413,6 +413,7 @@ def test_smoothing_is_log_euclidean_and_keeps_to_the_mask(rng, d):
     np.testing.assert_array_equal(hj.smooth_tensors(grid, D, 0), np.where(inside[..., None, None], D, np.eye(d)))
 
 
+@pytest.mark.slow
 def test_smoothing_lowers_noise_and_tells_what_it_smears(rng):
     grid = hj.Grid((16, 16))
     D = (1 + 0.3 * np.cos(np.arange(16) / 2))[:, None, None, None] * np.tile(np.eye(2), (16, 16, 1, 1))
@@ -426,6 +427,7 @@ def test_smoothing_lowers_noise_and_tells_what_it_smears(rng):
     assert np.corrcoef(shift.ravel(), np.asarray(smooth.smear)[4:-4].ravel())[0, 1] > 0.95
 
 
+@pytest.mark.slow
 def test_an_interrupted_computation_goes_on(rng, tmp_path):
     D, told = random_spd(rng, (3, 3), 0.1), []
     settings = {"noise": hj.TensorNoise.relative(D, 0.05), "draws": 22, "method": "resample"}
