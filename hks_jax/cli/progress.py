@@ -1,4 +1,9 @@
-"""Report progress on stderr: the stage, the elapsed and the remaining time, and warnings of the library."""
+"""Report progress on stderr: the stage, the elapsed and the remaining time, and warnings of the library.
+
+tqdm and rich draw bars for a known number of equal steps. Stages here have no such number, only a solver's estimate of
+the remaining time, and a log file gets a line every few seconds: rich writes nothing to it before the end, and tqdm
+writes one line of carriage returns.
+"""
 
 import io
 import shutil
