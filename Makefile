@@ -9,7 +9,7 @@
 #   make lint        lint, format and type checks
 #   make notebooks   run every notebook
 #   make docs        the documentation site, in site/
-#   make tables      tables and plots of benchmarks/results/, in the pages that show them
+#   make tables      tables and plots of benchmarks/results/, and the list of references, in the pages that show them
 #   make dist        wheel and sources, in dist/, built and checked
 #   make browser     Chromium, by apt-get, for the tests of the page to explore, which are skipped without
 #   make clean       remove what the above made
@@ -78,6 +78,7 @@ docs: $(STAMPS)/docs
 
 tables: $(STAMPS)/test
 	$(BIN)/python benchmarks/tables.py
+	$(BIN)/python docs/hooks/references.py
 
 # The wheel is built from the sources, so that nothing gets into it that they lack.
 dist: $(STAMPS)/dist

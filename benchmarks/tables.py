@@ -9,6 +9,7 @@ README.md, the pages in docs/ and those in benchmarks/ hold comments that name t
     <!-- measured: machine FILE -->                          the machine, and the file
     <!-- measured: table FILE[/PART] COLUMN COLUMN … -->     one line per row of the results
     <!-- measured: table FILE ROWS | COLUMNS | VALUE -->     values of one column in the rows and columns of others
+    <!-- measured: overview PROBLEM PROBLEM … -->            several programs on problems of several files, 64²/100
     <!-- measured: plot NAME -->                             one of `plots.PLOTS`
 
 A column written ``nodes³`` is that of cubes, ``nodes²`` that of squares: 64³ and 512² are the same number. Among the
@@ -21,6 +22,7 @@ import math
 import os
 import re
 import sys
+from contextlib import suppress
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -82,6 +84,18 @@ HEADINGS = {
     "least_ms": "least time, ms",
     "least_ms_before": "before",
 }
+GRIDS = "derivatives problem=*²,*³"
+OVERVIEW: list[tuple[str, list[str], list[str]]] = [
+    ("SciPy", [f"{file} solver=eigsh??SuperLU seconds" for file in ("eigensolvers", "volumes")], []),
+    ("SLEPc", ["eigensolvers solver=SLEPc??slicing??PETSc* seconds"], []),
+    ("hks_jax, first call", [f"{GRIDS} value_first_s"], [f"{GRIDS} gradient_first_s"]),
+    ("later calls", [f"{GRIDS} value_s"], [f"{GRIDS} value_and_gradient_s"]),
+    *(
+        (head, [f"accelerator_h200 way=host-driven {column}"], [f"accelerator_h200 way=gradient* {column}"])
+        for head, column in (("on a GPU, first call", "first_call_s"), ("later calls", "seconds"))
+    ),
+]
+"""The columns of an overview: where the seconds of a signature may be, and those of a signature with its gradient."""
 POWERS = {"²": 2, "³": 3}
 MARKED = re.compile(r"<!-- measured: (.*?) -->(?:\n\n(?:(?!<!-- measured).)*?<!-- end -->)?", re.DOTALL)
 
@@ -112,9 +126,11 @@ def section(request: str, page: Path) -> str:
     if kind == "table":
         name, _, columns = rest.partition(" ")
         return pivot(name, columns) if "|" in columns else table(name, columns.split())
+    if kind == "overview":
+        return overview(rest.split(), page)
     if kind == "plot":
         return f"![{caption(rest)}]({link(PICTURES / f'{rest}.svg', page)})"
-    raise ValueError(f"measured: got {request!r}; expected machine, table or plot")
+    raise ValueError(f"measured: got {request!r}; expected machine, table, overview or plot")
 
 
 def link(path: Path, page: Path) -> str:
@@ -249,6 +265,37 @@ def pivot(name: str, request: str) -> str:
         shown = [found.get(t, {}).get("not_run") or entry(found.get(t, {}), value) for t in tops]
         body.append([*line, *shown])
     return grid_of([*(heading(c) for c in left), *map(str, tops)], body)
+
+
+def overview(problems: list[str], page: Path) -> str:
+    """Return the seconds of a signature, alone and with its gradient, for problems NODES/K, and the results' files."""
+    body, used = [], {}
+    for problem in problems:
+        nodes, k = problem.split("/")
+        lines = [f"{nodes} nodes, {k} eigenpairs"], ["the same, with gradient"]
+        for _, *column in OVERVIEW:
+            for line, places in zip(lines, column, strict=True):
+                file, seconds = seconds_of(places, [f"nodes{nodes[-1]}={nodes}", f"k={k}"])
+                line.append(seconds)
+                used |= {file: load(file)} if file else {}
+        body += lines
+    devices: dict[str, list[str]] = {}
+    for file, content in used.items():
+        on, jax = content["machine"], content["versions"]["jax"]
+        device = f"{on['processor']}, {on['cores']} cores" if on["device"] == "cpu" else f"GPU {on['device']}"
+        devices.setdefault(f"{device}, JAX {jax}", []).append(f"[{file}.json]({link(RESULTS / f'{file}.json', page)})")
+    notes = "; ".join(f"{device}: {', '.join(files)}" for device, files in devices.items())
+    return f"{grid_of(['seconds', *(name for name, *_ in OVERVIEW)], body)}\n\n*{notes}.*"
+
+
+def seconds_of(places: list[str], filters: list[str]) -> tuple[str, str]:
+    """Return the file and the text of the entry at the first place, FILE COLUMN=PATTERN … COLUMN, that has one."""
+    for place in places:
+        name, *own, column = place.split()
+        with suppress(ValueError):
+            (row, *_), _ = chosen(name, [*filters, *own])
+            return name, entry(row, column)
+    return "", "—"
 
 
 def named() -> set[str]:

@@ -22,6 +22,7 @@ from typing import Any
 
 from hks_jax.accuracy import AccuracyWarning as AccuracyWarning
 from hks_jax.cache import keep_compiled as keep_compiled
+from hks_jax.compilation import compiler_options as compiler_options
 from hks_jax.curvature import gaussian_curvature as gaussian_curvature
 from hks_jax.curvature import hks_expansion as hks_expansion
 from hks_jax.curvature import laplace_beltrami as laplace_beltrami

@@ -59,6 +59,29 @@ def _understood() -> bool:
     return True
 
 
+def compiler_options() -> dict[str, bool | int | str]:
+    """Return the ``compiler_options`` of `jax.jit` with which a CPU's compiler is faster.
+
+    Pass the options to your outermost `jax.jit` or `equinox.filter_jit`; functions of this package that you call
+    outside `jax.jit` have them already. With the options, the gradient of a signature compiles in two thirds of the
+    time and in half of the memory, and then runs as fast as without. JAX refuses the options if the compiled function
+    is called within another `jax.jit` or differentiated by `jax.grad`: take derivatives inside, as in the example.
+
+    Returns:
+        The options; an empty dictionary if JAX's default device is no CPU, if the environment variable XLA_FLAGS sets
+        one of the options, or if the compiler does not know them.
+
+    Examples:
+        >>> def trace(T):
+        ...     return hj.heat_trace(hj.eigenpairs(hj.TensorField(field.grid, T), k=12), [0.1]).sum()
+        >>> step = jax.jit(jax.value_and_grad(trace), compiler_options=hj.compiler_options())
+        >>> value, gradient = step(field.tensors)
+        >>> gradient.shape
+        (9, 9, 2, 2)
+    """
+    return dict(_OPTIONS) if jax.default_backend() == "cpu" and _understood() else {}
+
+
 _FEW = 1 << 19
 """The largest total number of array entries for which many calls of NumPy take less time than one compilation."""
 

@@ -82,7 +82,7 @@ def loss(network, seen):
 optimiser = optax.adam(1e-2)
 
 
-@eqx.filter_jit
+@eqx.filter_jit(compiler_options=hj.compiler_options())
 def step(network, state, seen):
     value, gradient = eqx.filter_value_and_grad(loss)(network, seen)
     updates, state = optimiser.update(gradient, state)

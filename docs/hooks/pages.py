@@ -15,7 +15,6 @@ from types import ModuleType
 import commands
 import names
 import percent
-import references
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
@@ -67,7 +66,6 @@ def gallery() -> ModuleType:
 MARKERS: dict[str, Callable[[str], str]] = {
     "commands": commands.reference,
     "gallery": lambda name: gallery().code(name),
-    "references": references.listing,
 }
 """What replaces ``<!-- name: argument -->`` in a page, and needs the argument."""
 

@@ -1,9 +1,14 @@
-"""The list of references, from references.bib."""
+"""The list of references in docs/references.md, from references.bib.
+
+python docs/hooks/references.py    writes the list between the page's comments, as `make tables` does
+"""
 
 import re
 from pathlib import Path
 
 BIBLIOGRAPHY = Path(__file__).parents[2] / "references.bib"
+PAGE = Path(__file__).parents[1] / "references.md"
+LISTED = re.compile(r"(?<=<!-- references -->\n\n).*?(?=\n\n<!-- end -->)", re.DOTALL)
 
 
 def entries() -> list[dict[str, str]]:
@@ -32,6 +37,11 @@ def line(entry: dict[str, str]) -> str:
     return f"- {people(entry['author'])} ({entry['year']}). {entry['title']}. *{place}*{volume}{pages}.{doi}"
 
 
-def listing(_: str) -> str:
-    """Return all entries, by author and year."""
-    return "\n".join(line(entry) for entry in sorted(entries(), key=lambda entry: (entry["author"], entry["year"])))
+def filled() -> str:
+    """Return the page with all entries between its comments, by author and year."""
+    listing = "\n".join(line(entry) for entry in sorted(entries(), key=lambda entry: (entry["author"], entry["year"])))
+    return LISTED.sub(lambda _: listing, PAGE.read_text(encoding="utf-8"))
+
+
+if __name__ == "__main__":
+    PAGE.write_text(filled(), encoding="utf-8")

@@ -1,6 +1,7 @@
 """Compute the heat kernel signature of a tensor volume or a mesh, and the facts for the report."""
 
 import argparse
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
@@ -16,14 +17,15 @@ from hks_jax.cli.parsing import Times, parse_times
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.tensor_checks import Interpolation, MetricChoice, OperatorChoice
 from hks_jax.eigen.automatic import choose_solvers
+from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.boundary import BoundarySpec, default_boundary, unreached_sides
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result
-from hks_jax.io.units import median_mean_diffusivity
+from hks_jax.io.units import median_mean_diffusivity, unit_of_times
 from hks_jax.signatures.hks import Normalisation
 from hks_jax.signatures.rim import estimate_of, free_share, influence_of, is_estimated, is_known, rim_of
 from hks_jax.signatures.spans import SHORTEST, resolved_span
-from hks_jax.signatures.times import FREE, default_k, times_of
+from hks_jax.signatures.times import FREE, RESOLVED, default_k, times_of
 
 EARLY = 0.02
 """The truncated share of the signature above which the boundary's influence is estimated without eigenpairs."""
@@ -244,17 +246,34 @@ def compute_pairs(domain: OfVolume | OfMesh, settings: Settings, progress: Progr
         for message in unreached:
             progress.warn(message)
         pencil = hj.assemble(field, boundary)
-    return Solved(domain, solve(pencil, settings, progress), replace(settings, boundary=boundary))
-
-
-def solve(pencil: hj.Pencil | hj.MirrorPencil, settings: Settings, progress: Progress) -> hj.Eigenpairs:
-    """Compute eigenpairs; raise ComputationError unless all converge."""
     unknowns, dimension = sum(part.space.n_dof for part in pencil.parts), pencil.space.dimension
     assert dimension is not None
     k = default_k(dimension, unknowns) if settings.k is None else settings.k
-    solver = choose_solvers(settings.solver, pencil, k)[0]
+    _tell_of_resolution(k, pencil, domain, settings, progress)
+    return Solved(domain, _solve(pencil, k, settings.solver, progress), replace(settings, boundary=boundary))
+
+
+def _tell_of_resolution(
+    k: int, pencil: hj.Pencil | hj.MirrorPencil, domain: OfVolume | OfMesh, settings: Settings, progress: Progress
+) -> None:
+    """Say which times k eigenpairs will resolve, by Weyl's law, and how many pairs half of the length takes."""
+    d, place, unit, lengths = pencil.space.dimension, domain.place, "", None
+    if d is None or pencil.volume is None:
+        return
+    t = RESOLVED[d] / float(weyl(k, float(pencil.volume), d))
+    if isinstance(place, TensorVolume):
+        metric = "inverse" if settings.operator == "fick" else settings.metric
+        unit = unit_of_times(place, metric)
+        lengths = [math.sqrt(median_mean_diffusivity(place) * t)] if metric == "inverse" else None
+    (words,) = times_in_words([t], lengths, unit, getattr(place, "length_unit", ""))
+    progress.note(f"k = {k} will resolve t ≥ about {words}; half of this √t takes {2**d} times as many eigenpairs")
+
+
+def _solve(pencil: hj.Pencil | hj.MirrorPencil, k: int, name: str, progress: Progress) -> hj.Eigenpairs:
+    """Compute eigenpairs by the named solver; raise ComputationError unless all converge."""
+    unknowns, solver = sum(part.space.n_dof for part in pencil.parts), choose_solvers(name, pencil, k)[0]
     # The choice of a solver by name may differ between the two problems of "mean", so the name is handed on.
-    chosen = replace(solver, tolerance=_TOLERANCE) if isinstance(solver, hj.ChebyshevFilter) else settings.solver
+    chosen = replace(solver, tolerance=_TOLERANCE) if isinstance(solver, hj.ChebyshevFilter) else name
     with progress.stage("eigenpairs", f"{k} of {unknowns} by {solver.name}"):
         pairs = hj.eigenpairs(pencil, k, solver=chosen, progress=progress.update)
         jax.block_until_ready(pairs.eigenvalues)

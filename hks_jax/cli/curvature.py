@@ -97,7 +97,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         grid, box = cropped(volume, known)
         limit = float(np.quantile(np.abs(values), COLOURED)) or 1.0
         style: dict[str, Any] = {"cmap": "RdBu_r", "limits": [(-limit, limit)], "label": "in 1/length² of the metric"}
-        style |= {"orientation": placed(volume, box, args.view), "path": path}
+        style |= {"orientation": placed(volume, box, args.view), "path": path, "length_unit": volume.length_unit}
         hks_panels(curvature[None, *box], [0.0], grid, titles=["Gaussian curvature"], **style)
 
     with writing(args.output, report, progress, lambda: stale, {"curvature.png": draw}) as (folder, done):

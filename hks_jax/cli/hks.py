@@ -28,7 +28,6 @@ from pathlib import Path
 
 import numpy as np
 
-from hks_jax import SurfaceMesh, TetMesh
 from hks_jax.cli import options
 from hks_jax.cli.computation import compute_pairs
 from hks_jax.cli.noise import check_noise, noise_of, signature_of
@@ -40,7 +39,6 @@ from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import Reading
 from hks_jax.cli.source import read_source
 from hks_jax.io import TensorVolume
-from hks_jax.io.result import Result
 
 USAGE = "FILE -o OUT"
 
@@ -93,27 +91,6 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     result = signature_of(solved, noise, progress)
     from hks_jax.plot import signature_panels
 
-    panels = partial(signature_panels, result, view=args.view, through=args.through, show_rim=args.show_rim)
-    draw = panels if isinstance(domain.place, TensorVolume) else partial(_draw_mesh, result, args.show_rim)
+    draw = partial(signature_panels, result, view=args.view, through=args.through, show_rim=args.show_rim)
     done = write_outputs(args.output, result, progress, draw, *domain.images, origin=domain.origin)
     return done._replace(files=[*done.files, *kept])
-
-
-def _draw_mesh(result: Result, show_rim: bool, path: Path) -> None:
-    """Draw the signature on the surface, or on the boundary of a solid, with a separate colour scale for each time."""
-    from hks_jax.plot.images import colours_of
-    from hks_jax.plot.signature import LEAST_RANGE, caption, legend, nodes_for_colours, titles_of
-    from hks_jax.plot.surfaces import surface_panels
-
-    mesh = result.place
-    assert isinstance(mesh, SurfaceMesh | TetMesh)
-    cells, near = mesh.triangulation, None if show_rim else result.near_rim
-    visible = cells.boundary_vertices if isinstance(mesh, TetMesh) else cells.used
-    words = legend(result, near)
-    if near is not None and near[:, visible].all():  # as on the boundary of a solid, where hatching would show nothing
-        near, words = None, ["the boundary contributes over 10 % at all vertices"]
-    centre = 1.0 if result.normalisation == "flat" else None
-    shown = [values[nodes] for values, nodes in zip(result.values, nodes_for_colours(result, visible), strict=True)]
-    colours = colours_of(shown, least_range=LEAST_RANGE, centre=centre)
-    suptitle = "\n".join([caption(result), *words])
-    surface_panels(mesh, list(result.values), titles_of(result), colours, hatched=near, suptitle=suptitle, path=path)

@@ -84,8 +84,8 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     solved = saved or compute_pairs(domain, settings, progress)
     place, pairs, maps = domain.place, solved.pairs, None
     unit = place.length_unit if isinstance(place, TensorVolume) else "mm" * is_surface(args.file)
-    if pairs.part is not None:
-        odd = int((np.asarray(pairs.part) > 0).sum())
+    if len(pairs.problems) > 1:
+        odd = int((np.asarray(pairs.problem_numbers) > 0).sum())
         progress.note(
             f"{odd} of {pairs.k} modes are odd, and maps have no part in them; --boundary neumann has no odd modes"
         )

@@ -65,9 +65,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--quantiles",
         type=quantiles,
-        default=(0.0, 1.0),
         metavar="Q,Q",
-        help="quantiles of the values at the two ends of an own or shared range of colours (default 0,1)",
+        help="quantiles of the values at the two ends of an own or shared range of colours (default: 0.002,0.998 of a "
+        "signature's values free of the boundary, as 'hks-jax hks' draws them; 0,1 of other arrays)",
     )
     parser.add_argument(
         "--cmap",
@@ -150,43 +150,61 @@ def _choose_times(result: Result, args: argparse.Namespace) -> np.ndarray:
 
 def _panels(result: Result, args: argparse.Namespace) -> Any:
     from hks_jax.plot import hks_panels, middle_node
-    from hks_jax.plot.signature import LEAST_RANGE, caption, cropped, legend, placed, titles_of
+    from hks_jax.plot.signature import (
+        LEAST_RANGE,
+        anatomy,
+        caption,
+        cropped,
+        free_colours,
+        legend,
+        placed,
+        quantity,
+        range_notes,
+        titles_of,
+    )
 
     signature = result.name == "hks"
     values, volume, title = result.values, result.volume, args.title or (caption(result) if signature else "")
-    near = result.near_rim if signature and not args.show_rim else None
-    if signature and not args.title:
-        title = "\n".join([title, *legend(result, near)])
+    near = result.near_rim if signature else None
+    beside = anatomy(result) if signature else {}
+    place = ""
     if volume.dimension == 3:
         axis, index = args.slice or ("z", middle_node(result.grid.inside)[2])
         volume = sliced(volume, axis, index)
-        values = values.take(index, 1 + "xyz".index(axis))
-        near = None if near is None else near.take(index, 1 + "xyz".index(axis))
-        title = f"slice {axis} = {index}: {title}".rstrip(": ")
+        across = "xyz".index(axis)
+        values = values.take(index, 1 + across)
+        near = None if near is None else near.take(index, 1 + across)
+        beside = {name: scalar.take(index, across) for name, scalar in beside.items()}
+        place = f"slice {axis} = {index}"
     else:
         refuse(args, ("slice",), f"{args.result} is a slice, with two axes; leave this option out")
     drawn = volume.inside & np.isfinite(values).all(axis=0)
     if not drawn.any():
         raise ValueError(f"--slice: no value of {args.result} in this slice is finite; choose another slice")
     plane, box = cropped(volume, drawn)
-    vmin, vmax = (None, None) if isinstance(args.range, str) else args.range
-    around_one = signature and result.normalisation == "flat" and args.cmap is None and vmin is None
+    values, hatched = np.where(drawn, values, np.nan), None if args.show_rim else near
+    style: dict[str, Any] = {"cmap": args.cmap, "label": quantity(result) if signature else ""}
+    notes, centre = legend(result, hatched) if signature else [], result.centre if args.cmap is None else None
+    if signature and isinstance(args.range, str) and args.quantiles is None:  # as the command hks draws it
+        colours = free_colours(values, near, drawn, centre, args.range == "shared")
+        style |= {"limits": [each[:2] for each in colours], "cmap": args.cmap or colours[0].cmap}
+        notes += range_notes(result, values, colours)
+    else:
+        style |= dict(zip(("vmin", "vmax"), (None, None) if isinstance(args.range, str) else args.range, strict=True))
+        style |= {"centre": centre if style["vmin"] is None else None, "shared_range": args.range == "shared"}
+        style |= {"quantiles": args.quantiles or (0.0, 1.0), "least_range": LEAST_RANGE}
     titles = titles_of(result, args.unit_of_t) if signature else None
     return hks_panels(
-        np.where(drawn, values, np.nan)[:, *box],
+        values[:, *box],
         result.times if result.times.size else [0.0],
         plane,
         titles=titles if result.times.size else [args.array or args.result.stem],
-        shared_range=args.range == "shared",
-        cmap=args.cmap,
-        centre=1.0 if around_one else None,
-        vmin=vmin,
-        vmax=vmax,
-        quantiles=args.quantiles,
-        least_range=LEAST_RANGE,
-        suptitle=title,
-        hatched=None if near is None else near[:, *box],
+        length_unit=volume.length_unit,
+        beside={name: np.where(drawn, scalar, np.nan)[box] for name, scalar in beside.items()},
+        suptitle="\n".join([": ".join(filter(None, (place, title))), *([] if args.title else notes)]).strip(),
+        hatched=None if hatched is None else hatched[:, *box],
         orientation=placed(volume, box, args.view),
+        **style,
     )
 
 

@@ -170,7 +170,7 @@ def _draw(domain: OfVolume, args: argparse.Namespace, before: np.ndarray, after:
     values = cut(values)
     grid, box = cropped(volume, np.isfinite(values[1]))
     style: dict[str, Any] = {"limits": [_limits(values[1:])] * 3, "label": ""}
-    style |= {"orientation": placed(volume, box, args.view), "path": path}
+    style |= {"orientation": placed(volume, box, args.view), "path": path, "length_unit": volume.length_unit}
     hks_panels(values[:, *box], [0.0] * 3, grid, titles=_titles(args.fwhm), **style)
 
 

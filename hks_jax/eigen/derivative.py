@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -78,15 +78,25 @@ def _solved_jvp(
     # Metric and density are removed: derivatives do not need them, and reverse mode would store their arrays.
     pencil = replace(pencil, metric=None, density=None)
     on_failure: OnFailure = "error" if throw else "nothing" if is_traced(primals) else "warning"
-    known = prepared, pencil, origin, values, vectors, functions
-    settings, shapes = (adjoint, on_failure), (eigenvalues, functions)
-    tangents = linear_program(_tangents, settings, known, change, shapes, _by_numpy)
+    known, settings = _Known(prepared, pencil, origin, values, vectors, functions), (adjoint, on_failure)
+    tangents = linear_program(_tangents, settings, (known,), change, (eigenvalues, functions), _by_numpy)
     constants = following if extra else jnp.full_like(following, jnp.inf), complete_below
     return (eigenvalues, functions, *constants), (*tangents, *map(jnp.zeros_like, constants))
 
 
+class _Known(NamedTuple):
+    """The constants of the derivative: the matrices K − σM and M, their first p eigenpairs, and k of the vectors."""
+
+    prepared: Any  # the result of `Adjoint.prepare`
+    pencil: SymmetricPencil
+    origin: Scalar  # σ
+    values: Values  # (p,) the eigenvalues of K − σM and M
+    vectors: Vectors
+    functions: Rows  # the first k vectors, because slicing ``vectors`` would copy the slice
+
+
 def _computed(solver: Eigensolver, pencil: Pencil, k: int, report: Report) -> RawPairs:
-    values, vectors, bound = one_by_one(_lowest, (solver, k, report), pencil)
+    values, vectors, bound = one_by_one(_by_solver, (solver, k, report), pencil)
     if pencil.null_space is not None and pencil.n_null:
         values, vectors = _with_null_modes(pencil.mass, pencil.null_space.vectors, values, vectors)
     return values, vectors, bound
@@ -109,17 +119,9 @@ def _solves(pencil: SymmetricPencil, k: int, p: int) -> bool:
     return p < pencil.size and pencil.n_fixed < k
 
 
-def _by_numpy(
-    adjoint: Adjoint,
-    on_failure: OnFailure,
-    prepared: Any,
-    pencil: SymmetricPencil,
-    origin: Scalar,
-    values: Values,
-    vectors: Vectors,
-    functions: Rows,
-) -> HostMap | None:
+def _by_numpy(adjoint: Adjoint, on_failure: OnFailure, known: _Known) -> HostMap | None:
     """Return `_tangents` by NumPy."""
+    prepared, pencil, origin, values, vectors, functions = known
     if vectors.size > _ON_HOST:
         return None
     k, rows = len(functions), np.asarray(functions)
@@ -162,23 +164,9 @@ def change_of(change: SymmetricPencil, x: Rows, *p: Rows) -> SymmetricPencil:
 
 # Without the checkpoint, reverse mode would store copies of the eigenvectors.
 @partial(jax.checkpoint, static_argnums=(0, 1))
-def _tangents(
-    adjoint: Adjoint,
-    on_failure: OnFailure,
-    prepared: Any,
-    pencil: SymmetricPencil,
-    origin: Scalar,
-    values: Values,
-    vectors: Vectors,
-    functions: Rows,
-    change: SymmetricPencil,
-) -> tuple[OfRows, Rows]:
-    """Return the tangents of the first k of p computed eigenvalues, and of the frame of `solved`.
-
-    ``prepared`` is the result of `Adjoint.prepare`. ``pencil`` and ``values`` are those of K − σM for the ``origin`` σ;
-    ``change`` is that of K and M. ``functions`` are the first k vectors, passed separately because slicing ``vectors``
-    would copy the slice.
-    """
+def _tangents(adjoint: Adjoint, on_failure: OnFailure, known: _Known, change: SymmetricPencil) -> tuple[OfRows, Rows]:
+    """Return the tangents of the first k eigenvalues, and of the frame of `solved`, for the change of K and M."""
+    prepared, pencil, origin, values, vectors, functions = known
     k = len(functions)
     eigenvalues, guards = values[:k] + origin, vectors[k:]
     moved = change.mass.apply(functions)
@@ -204,7 +192,7 @@ def _tangents(
 
 
 # `one_by_one` needs the same function object in every call; so the next two functions are at module level.
-def _lowest(solver: Eigensolver, k: int, report: Report, pencil: SymmetricPencil) -> RawPairs:
+def _by_solver(solver: Eigensolver, k: int, report: Report, pencil: SymmetricPencil) -> RawPairs:
     return solver.lowest(pencil, k, report)
 
 

@@ -1,66 +1,208 @@
-"""Eigenpairs of a doubled domain: the problems of its parts are solved, and their spectra are merged."""
+"""Eigenpairs of a doubled domain: those of its even and odd problems, merged where somebody asks for them."""
 
 import math
 import time
-from functools import partial
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Any
 
+import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from hks_jax.arrays import jax_array
-from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.eigen.one_pencil import solve_lowest, widened
-from hks_jax.eigen.rotations import with_rotations
+from hks_jax.compilation import numpy_where_known
+from hks_jax.eigen.automatic import choose_solvers
+from hks_jax.eigen.eigenpairs import Eigenpairs, PencilEigenpairs, view
+from hks_jax.eigen.one_pencil import pairs_of_pencil
 from hks_jax.eigen.solver import Dense, Eigensolver, Report, Status
 from hks_jax.fem.pencil import MirrorPencil
 from hks_jax.traced import is_traced
 
+Including = tuple[tuple[int, ...], ...]
+"""See `MirrorPencil.including`."""
 
-def solve_doubled(
-    pencil: MirrorPencil, solvers: list[Eigensolver], k: int, extra: int, throw: bool, report: Report
-) -> Eigenpairs:
-    """Return the k lowest pairs of a doubled domain, from the problems of its parts; ``extra`` = 1 adds one eigenvalue.
 
-    For traced values, each part's problem is solved for the largest number of pairs that this part can have among the k
-    lowest (`_limits`). For concrete values, each part's problem is first solved for an equal share of the k pairs plus
-    a margin, and again for twice as many pairs while some of its pairs may be missing. The margin is about 2√k, because
-    by Weyl's law boundary conditions change the number of a part's pairs among the k lowest by about √k.
+def _merged(name: str) -> Any:
+    """Return a property: the attribute of the problems' pairs, merged in ascending order of eigenvalues."""
+    return property(lambda pairs: pairs.merged([getattr(each, name) for each in pairs.problems]))
+
+
+class DoubledEigenpairs(Eigenpairs, eqx.Module):
+    """The k lowest eigenpairs of a doubled domain, which are views of the pairs of its even and odd problems.
+
+    Attributes:
+        problems: the eigenpairs of each problem; `kept` marks those that are among the k lowest of the doubled domain.
+        including: the inclusions of the problems' function spaces; see `MirrorPencil`.
+        k: the number of pairs.
     """
-    parts, total = pencil.parts, k + extra
-    whole, limits = widened(pencil, solvers, total), _limits(pencil, total)
-    traced = is_traced(jax.lax.stop_gradient(pencil))
-    share = math.ceil(total / len(parts)) + 2 * math.isqrt(total) + 4
-    wanted = limits if traced else [min(limit, share) for limit in limits]
-    # All pairs of a small part may be needed, and an iterative solver cannot compute all pairs.
-    solvers = [
-        solver if limit <= solver.max_pairs(part.size) else Dense(solver.tolerance)
-        for solver, part, limit in zip(solvers, parts, limits, strict=True)
-    ]
 
-    def solve(number: int, report: Report) -> Eigenpairs:
-        return solve_lowest(whole.parts[number], solvers[number], wanted[number], 0, throw, report)
+    problems: tuple[PencilEigenpairs, ...]
+    including: Including = eqx.field(static=True)
+    k: int = eqx.field(static=True)
+
+    eigenvalues = _merged("eigenvalues")
+    residuals = _merged("residuals")
+    converged = _merged("converged")
+    rounding = _merged("rounding")
+    kept = _merged("kept")
+
+    def merged(self, values: Sequence[Any]) -> Array:
+        """Return the values (…, k) for each pair, given those for the pairs of each problem."""
+        return _in_order(list(values), self._spectra, self.including, self.k, -1)
+
+    # An eigenfunction has norm 1 on the domain doubled m times, hence norm 1/√2ᵐ on the domain itself. The values at
+    # the free nodes of the even problem, which has all free nodes, are 0 at Dirichlet nodes of the other problems.
+    def _functions(self, of_problems: Sequence[Float[Array, "_k _n"]]) -> Float[Array, "k n_dof"]:
+        rows = [each.space.transfer(own, self.space) for each, own in zip(self.problems, of_problems, strict=True)]
+        return _in_order(rows, self._spectra, self.including, self.k, -2) / math.sqrt(len(rows))
+
+    @view
+    def vectors(self) -> Float[Array, "k n_dof"]:
+        """The coefficients of the eigenfunctions, with norm 1 on the doubled domain."""
+        return self._functions([each.vectors for each in self.problems])
+
+    @view
+    def at_nodes(self) -> Float[Array, "k n_dof"]:
+        """The eigenfunctions' values at the free nodes."""
+        return self._functions([each.at_nodes for each in self.problems])
+
+    @view
+    def next_eigenvalue(self) -> Float[Array, ""]:
+        """The first eigenvalue that is not kept."""
+        return _over([each.next_eigenvalue for each in self.problems], "nanmin")
+
+    @view
+    def complete_below(self) -> Float[Array, ""]:
+        """The bound below which none of the eigenvalues is missing in any problem."""
+        return _over([each.complete_below for each in self.problems], "min")
+
+    @view
+    def spectral_origin(self) -> Float[Array, ""]:
+        """The origin of the even problem, whose lowest eigenvalue is the lowest of all."""
+        return self.problems[0].spectral_origin
+
+    @view
+    def multiplet_tolerance(self) -> Float[Array, ""]:
+        """The largest tolerance of all problems."""
+        return _over([each.multiplet_tolerance for each in self.problems], "max")
+
+    @view
+    def pencil(self) -> MirrorPencil | None:
+        """The matrices of all problems."""
+        pencils = tuple(each.pencil for each in self.problems)
+        return None if None in pencils else MirrorPencil(pencils, self.including)
+
+    @view
+    def solver_name(self) -> str:
+        """The names of the problems' solvers."""
+        return " + ".join(dict.fromkeys(each.solver_name for each in self.problems))
+
+    def with_problems(self, problems: Iterable[PencilEigenpairs]) -> "DoubledEigenpairs":
+        """Return the pairs of other problems."""
+        return replace(self, problems=tuple(problems))
+
+    def keeping(self, kept: Bool[Array, " k"]) -> "DoubledEigenpairs":
+        """Keep only the marked pairs, the lowest ones, which are the lowest ones of each problem."""
+        own = _split(jax.lax.stop_gradient(self._spectra), kept, self.including, self.k)
+        return self.with_problems(each.keeping(mask) for each, mask in zip(self.problems, own, strict=True))
+
+    @property
+    def _spectra(self) -> list[Float[Array, " _k"]]:
+        return [each.eigenvalues for each in self.problems]
+
+
+# If the function space of problem B includes that of problem A, the j-th eigenvalue of A is not below the j-th
+# eigenvalue of B. If the j-th eigenvalues of both problems are equal, rounding may exchange their order, so that A
+# could have more of the lowest eigenvalues of the doubled domain than `MirrorPencil.including` allows. So eigenvalues
+# are sorted by the maximum of a problem's j-th eigenvalue and those of all problems that include this problem.
+def _order(xp: Any, spectra: Any, including: Including, k: int) -> Any:
+    """Return the places (…, k) of the k lowest eigenvalues in the concatenated spectra of all problems."""
+    keys: list[Any] = []
+    for own, others in zip(spectra, including, strict=True):
+        for key in (keys[j] for j in others[:-1]):
+            both = min(own.shape[-1], key.shape[-1])
+            own = xp.concatenate([xp.maximum(own[..., :both], key[..., :both]), own[..., both:]], axis=-1)
+        keys.append(own)
+    return xp.argsort(xp.concatenate(keys, axis=-1), axis=-1, stable=True)[..., :k]
+
+
+@numpy_where_known(static_argnums=(2, 3, 4))
+def _in_order(xp: Any, values: Any, spectra: Any, including: Including, k: int, axis: int) -> Any:
+    """Return the values of all problems, along an axis, in the order of the k lowest eigenvalues."""
+    order, whole = _order(xp, spectra, including, k), xp.concatenate(values, axis=axis)
+    if order.ndim == 1:
+        return xp.take(whole, order, axis=axis)
+    return xp.take_along_axis(whole, order if axis == -1 else order[..., None], axis=axis)
+
+
+@numpy_where_known(static_argnums=1)
+def _over(xp: Any, values: Any, name: str) -> Any:
+    return getattr(xp, name)(xp.stack(values), axis=0)
+
+
+@numpy_where_known(static_argnums=(2, 3))
+def _split(xp: Any, spectra: Any, kept: Any, including: Including, k: int) -> Any:
+    """Return the mask of each problem's pairs that are among the kept ones of the k lowest."""
+    sizes = [len(each) for each in spectra]
+    problem = xp.asarray(np.repeat(np.arange(len(sizes)), sizes))[_order(xp, spectra, including, k)]
+    return [xp.arange(size) < xp.sum(kept & (problem == i)) for i, size in enumerate(sizes)]
+
+
+def pairs_of_doubled(
+    pencil: MirrorPencil, solver: str | Eigensolver, k: int, throw: bool, report: Report
+) -> DoubledEigenpairs:
+    """Return the k lowest pairs of a doubled domain, from its problems, each solved for one more eigenvalue.
+
+    For traced values, each problem is solved for the largest number of pairs that it can have among the k lowest
+    (`_limits`). For concrete values, each problem is first solved for an equal share of the k pairs plus a margin, and
+    again for twice as many pairs while some of its pairs may be missing.
+    """
+    parts, limits = pencil.parts, _limits(pencil, k)
+    traced = is_traced(jax.lax.stop_gradient(pencil))
+    wanted = limits if traced else [min(limit, _share(pencil, k)) for limit in limits]
+    solvers = choose_solvers(solver, pencil, k)
+
+    def solve(number: int, report: Report) -> PencilEigenpairs:
+        part, own, limit = parts[number], solvers[number], limits[number]
+        extra = min(1, part.size - wanted[number])
+        if limit + extra > own.max_pairs(part.size):  # all pairs of a small problem may be needed
+            own = Dense(own.tolerance)
+        return pairs_of_pencil(part, own, wanted[number], extra, throw, report)
 
     solved = [solve(i, _of_problem(report, i, len(parts))) for i in range(len(parts))]
     while not traced:
-        spectra = [np.asarray(jax.lax.stop_gradient(pairs.eigenvalues)) for pairs in solved]
-        merged = np.sort(np.concatenate(spectra))
-        reach = merged[total - 1] if merged.size >= total else np.inf
-        short = [i for i, spectrum in enumerate(spectra) if wanted[i] < limits[i] and not spectrum[-1] >= reach]
+        known = jax.lax.stop_gradient([(pairs.eigenvalues, pairs.next_eigenvalue) for pairs in solved])
+        merged = np.sort(np.concatenate([np.append(*each) for each in known]))
+        reach = merged[k] if merged.size > k else np.inf
+        short = [i for i, (_, end) in enumerate(known) if wanted[i] < limits[i] and not end >= reach]
         if not short:
             break
         for i in short:
             wanted[i] = min(limits[i], 2 * wanted[i])
             solved[i] = solve(i, report)
-    assert isinstance(whole, MirrorPencil)
-    return merge(whole, tuple(solved), k, extra)
+    return DoubledEigenpairs(tuple(solved), pencil.including, k).keeping(jax_array(np.ones(k, bool)))
 
 
-def _limits(pencil: MirrorPencil, total: int) -> list[int]:
-    """Return, for each part, the largest possible number of its pairs among the ``total`` lowest pairs of all parts."""
+def _limits(pencil: MirrorPencil, k: int) -> list[int]:
+    """Return, for each problem, the largest possible number of its pairs among the k lowest pairs of all problems."""
     shares = zip(pencil.including, pencil.parts, strict=True)
-    return [min(max(total // len(including), 1), part.size) for including, part in shares]
+    return [min(max(k // len(including), 1), part.size) for including, part in shares]
+
+
+# By Weyl's law, a problem has N(λ) ≈ V λ^(3/2)/6π² ± S λ/16π eigenvalues below λ in 3D, and (A λ ± L √λ)/4π in 2D; S
+# or L is the measure of its boundary. The boundary terms of all problems cancel: with the share m = k/n of each of n
+# problems, the k-th eigenvalue of all is about (6π²m/V)^(2/3) or 4πm/A. There the boundary term of the even problem is
+# S V^(−2/3) (6π²m)^(2/3)/16π or L √(m/4πA): for a cube 1.8 m^(2/3), for a square 1.1 √m. The margin is 2.5 times as
+# large, for domains with a longer boundary.
+_MARGIN = {2: 2.8, 3: 4.5}
+
+
+def _share(pencil: MirrorPencil, k: int) -> int:
+    """Return a number of pairs that each problem rarely exceeds among the k lowest pairs of all problems."""
+    d, mean = pencil.space.dimension, k / len(pencil.parts)
+    return math.ceil(mean + _MARGIN[d] * mean ** (1 - 1 / d)) + 4
 
 
 def _of_problem(report: Report, number: int, of: int) -> Report:
@@ -74,68 +216,3 @@ def _of_problem(report: Report, number: int, of: int) -> Report:
         report(Status(f"problem {number + 1} of {of}: {text}", left))
 
     return tell
-
-
-@partial(jax.jit, static_argnames=("k", "extra"))
-def merge(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], k: int, extra: int) -> Eigenpairs:
-    """Merge the pairs of all parts, and return the k lowest; with ``extra`` = 1, also return the next eigenvalue."""
-    values, sizes = jnp.concatenate([pairs.eigenvalues for pairs in solved]), [pairs.k for pairs in solved]
-    order = jnp.argsort(jnp.concatenate(_sorted_by(pencil, solved)))
-    lowest, ends = order[:k], np.cumsum(sizes)[:-1]
-    chosen = jnp.split(jnp.zeros(values.size, bool).at[lowest].set(True), ends)
-    frames = [  # a chosen vector also rotates towards computed vectors that are not chosen
-        with_rotations(p.frame, jax.lax.stop_gradient(p.eigenvalues), c[:, None] & ~c[None], None, p.pencil)
-        for p, c in zip(solved, chosen, strict=True)
-    ]
-    rows = [p.space.transfer(own, pencil.space) for p, own in zip(solved, frames, strict=True)]
-
-    return Eigenpairs(
-        eigenvalues=values[lowest],
-        residuals=jnp.concatenate([pairs.residuals for pairs in solved])[lowest],
-        converged=jnp.concatenate([pairs.converged for pairs in solved])[lowest],
-        rounding=jnp.concatenate([pairs.rounding for pairs in solved])[lowest],
-        kept=jnp.ones(k, bool),
-        next_eigenvalue=jax.lax.stop_gradient(values[order[k]]) if extra else jnp.asarray(jnp.inf, values.dtype),
-        complete_below=_complete_below(pencil, solved, values[order[k + extra - 1 :][:1]], k + extra),
-        spectral_origin=solved[0].spectral_origin,
-        multiplet_tolerance=jnp.max(jnp.stack([pairs.multiplet_tolerance for pairs in solved])),
-        part=jax_array(np.repeat(np.arange(len(solved)), sizes))[lowest],
-        # An eigenfunction has norm 1 on the domain doubled m times, hence norm 1/√2ᵐ on the domain itself.
-        frame=jnp.concatenate(rows)[lowest] / math.sqrt(len(solved)),
-        pencil=pencil,
-        solver_name=" + ".join(dict.fromkeys(pairs.solver_name for pairs in solved)),
-    )
-
-
-# If the trial functions of part B include those of part A, the j-th eigenvalue of part A is not below the j-th
-# eigenvalue of part B. If the j-th eigenvalues of both parts are equal, rounding may exchange their order, so that part
-# A could have more of the lowest eigenvalues of the doubled domain than `MirrorPencil.including` allows.
-def _sorted_by(pencil: MirrorPencil, solved: tuple[Eigenpairs, ...]) -> list[Float[Array, " _"]]:
-    """Return sort keys: the maximum of a part's j-th eigenvalue and those of all parts that include this part."""
-    keys: list[Array] = []
-    for pairs, including in zip(solved, pencil.including, strict=True):
-        own = pairs.eigenvalues
-        for j in including[:-1]:
-            both = min(len(own), len(keys[j]))
-            own = own.at[:both].max(keys[j][:both])
-        keys.append(own)
-    return keys
-
-
-def _complete_below(
-    pencil: MirrorPencil, solved: tuple[Eigenpairs, ...], reach: Float[Array, " 1"], total: int
-) -> Float[Array, ""]:
-    """Return the bound below which no eigenvalue of the doubled domain is missing.
-
-    A part's solver may certify completeness only below the part's last computed eigenvalue. But a part with as many
-    pairs as `_limits` allows has no further eigenvalue below ``reach``, the last of the ``total`` lowest eigenvalues.
-    """
-    bounds = []
-    for pairs, limit in zip(solved, _limits(pencil, total), strict=True):
-        bound = pairs.complete_below
-        if pairs.k < pairs.space.n_dof:
-            last = pairs.eigenvalues[-1]
-            beyond = jnp.maximum(last, reach[0]) if pairs.k >= limit else last
-            bound = jnp.where(bound >= last, beyond, bound)
-        bounds.append(bound)
-    return jnp.min(jnp.stack(bounds))

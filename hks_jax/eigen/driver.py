@@ -7,11 +7,12 @@ import numpy as np
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import require_static
-from hks_jax.eigen.automatic import choose_solvers
-from hks_jax.eigen.doubled import solve_doubled
-from hks_jax.eigen.eigenpairs import RESULTS, SPARE, Eigenpairs, MultipletChoice, truncate
+from hks_jax.eigen.automatic import choose_solver
+from hks_jax.eigen.doubled import pairs_of_doubled
+from hks_jax.eigen.eigenpairs import RESULTS, Eigenpairs
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
-from hks_jax.eigen.one_pencil import solve_lowest, widened
+from hks_jax.eigen.multiplets import SPARE, MultipletChoice
+from hks_jax.eigen.one_pencil import pairs_of_pencil
 from hks_jax.eigen.shift_invert.shift_invert import ShiftInvert
 from hks_jax.eigen.solver import Eigensolver, Report, silent
 from hks_jax.fem.assembly import MassKind
@@ -91,7 +92,7 @@ def eigenpairs(
             f"k: got {k}; expected an integer from 1 to {total}, the number of degrees of freedom. "
             "Use a smaller k or a finer grid"
         )
-    pairs = _lowest(pencil, int(number), solver, multiplet, throw, progress or silent).on(pencil)
+    pairs = _pairs_of(pencil, int(number), total, solver, multiplet, throw, progress or silent)
     known = jax.lax.stop_gradient(pairs)
     if is_traced(known.eigenvalues):
         return known.result.error_if(pairs, known.result != RESULTS.successful) if throw else pairs
@@ -153,19 +154,25 @@ def eigsh(
     return eigenpairs(K if M is None else (K, M), k, solver=solver or "auto", throw=throw, progress=progress)
 
 
-def _lowest(
-    pencil: AnyPencil, k: int, solver: str | Eigensolver, multiplet: MultipletChoice, throw: bool, report: Report
+def _pairs_of(
+    pencil: AnyPencil,
+    k: int,
+    total: int,
+    solver: str | Eigensolver,
+    multiplet: MultipletChoice,
+    throw: bool,
+    report: Report,
 ) -> Eigenpairs:
-    total = sum(part.size for part in pencil.parts)
     size = min(k + SPARE, total) if multiplet == "complete" else k
-    solvers = choose_solvers(solver, pencil, size)
-    extra = min(1, total - size)  # the next eigenvalue shows whether k cuts a multiple eigenvalue
+    pairs: Eigenpairs
     if isinstance(pencil, MirrorPencil):
-        pairs = solve_doubled(pencil, solvers, size, extra, throw, report)
+        pairs = pairs_of_doubled(pencil, solver, size, throw, report)
     else:
-        pairs = solve_lowest(widened(pencil, solvers, size + extra).parts[0], solvers[0], size, extra, throw, report)
+        chosen = choose_solver(solver, pencil, size)
+        extra = min(1, total - size)  # the next eigenvalue shows whether k cuts a multiple eigenvalue
+        pairs = pairs_of_pencil(pencil, chosen, size, extra, throw, report)
         found = jax.lax.stop_gradient(pairs)
-        doubtful = solver == "auto" and isinstance(solvers[0], ShiftInvert) and not pencil.bounded
+        doubtful = solver == "auto" and isinstance(chosen, ShiftInvert) and not pencil.bounded
         if doubtful and (found.unconfirmed or not found.converged.all()):  # for example, if k cuts a large multiplet
-            pairs = solve_lowest(pencil, BlockLanczos(), size, extra, throw, report)
-    return truncate(pairs, k, multiplet)
+            pairs = pairs_of_pencil(pencil, BlockLanczos(), size, extra, throw, report)
+    return pairs.truncated(k, multiplet)

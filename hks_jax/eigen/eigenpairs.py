@@ -1,6 +1,8 @@
 """Eigenpairs, the indicators of their quality, and the truncation of a spectrum."""
 
-from typing import Any, Literal, NamedTuple
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -8,12 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hks_jax.arrays import describe_array
+from hks_jax.arrays import describe_array, jax_array
 from hks_jax.compilation import numpy_where_known
 from hks_jax.domain.tensor_checks import MANY
+from hks_jax.eigen.multiplets import MultipletChoice, Spectrum, is_unconfirmed, kept_of, number_cut, numbered
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.rotations import of_simple, with_rotations
-from hks_jax.fem.pencil import AnyPencil
+from hks_jax.fem.pencil import AnyPencil, Pencil
 from hks_jax.fem.space import FunctionSpace, MatrixSpace
 from hks_jax.traced import is_traced
 
@@ -44,15 +47,20 @@ class RESULTS(eqx.Enumeration):
     )
 
 
-class Eigenpairs(eqx.Module):
+class Eigenpairs(ABC):
     """The k lowest eigenpairs of Kφ = λMφ; a pytree.
 
-    The derivatives of signatures with respect to the matrices use `pencil` and `frame`, not `eigenvalues`. So do not
-    rescale `eigenvalues` or `frame`: derivatives of signatures would then refer to the new arrays, not to the matrices.
-    Rescale times or the pencil instead.
+    The derivatives of signatures with respect to the matrices use the pencil, not `eigenvalues`. So do not rescale
+    `eigenvalues`: derivatives of signatures would then refer to the new array, not to the matrices. Rescale times or
+    the pencil instead.
 
     Attributes:
         eigenvalues: (k,) in ascending order, in 1/(metric length)²; exactly 0 for null vectors.
+        vectors: (k, n_dof) the coefficients of the eigenfunctions, with φᵢᵀMφⱼ = δᵢⱼ. For the boundaries "mirror" and
+            "mean", M is the mass of the domain doubled m times; on the domain itself, the norm of each φᵢ is 1/√2ᵐ. The
+            derivative of a vector is NaN unless its eigenvalue is simple and kept.
+        at_nodes: (k, n_dof) the eigenfunctions' values at the free nodes: `vectors`, unless the quadrature is
+            ``"cancelling"``.
         residuals: (k,) ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁), where λ₁ is the first positive eigenvalue. If the null
             space is unknown, max(λ, λ₁) is replaced by the larger of two numbers: the mean gap of the eigenvalues, and
             the distance of λ from the spectrum's known lower bound or, without one, from the lowest eigenvalue.
@@ -62,7 +70,7 @@ class Eigenpairs(eqx.Module):
             the rounding of the largest one may change it by more than 1 % (outside of `jit` on CPUs), or 100 % (under
             `jit` and on accelerators). Derivatives treat `rounding` as a constant.
         kept: (k,) whether each pair belongs to the truncated spectrum; signatures ignore the other pairs. The choices
-            ``multiplet="drop"`` and ``"complete"`` may exclude the last pairs; `of_part` keeps only one part's pairs.
+            ``multiplet="drop"`` and ``"complete"`` may exclude the last pairs.
         next_eigenvalue: the first eigenvalue that is not kept; infinite if it does not exist. Derivatives treat
             `next_eigenvalue` as a constant.
         complete_below: the bound below which the solver certifies that it missed no eigenvalue, by Sylvester's law of
@@ -71,16 +79,18 @@ class Eigenpairs(eqx.Module):
         spectral_origin: the reference point of relative errors: 0 if K ⪰ 0 is known, otherwise the lowest eigenvalue.
         multiplet_tolerance: the gap, relative to the distance from `spectral_origin`, below which neighbouring
             eigenvalues count as equal. If the null space is unknown, gaps at the level of rounding count as zero too.
-        part: (k,) for the boundaries "mirror" and "mean", the index of the pencil's part that each pair belongs to (0
-            is the Neumann problem); otherwise None.
-        frame: (k, n_dof) the values of `vectors`, but with a derivative that excludes rotations of eigenvectors among
-            themselves, which are singular at multiple eigenvalues. Derivatives of signatures include the effect of such
-            rotations by divided differences.
+        problems: the eigenpairs of each problem, which belong to one pencil. For the boundaries "mirror" and "mean",
+            these are the even problem (Neumann) and the odd problems; their `kept` marks the pairs that are among the
+            k lowest of the doubled domain. Signatures are the mean of the problems' signatures. For other boundaries,
+            the only problem is the result itself.
         pencil: the matrices K and M.
         solver_name: the name of the solver.
+        k: the number of pairs.
     """
 
     eigenvalues: Float[Array, " k"]
+    vectors: Float[Array, "k n_dof"]
+    at_nodes: Float[Array, "k n_dof"]
     residuals: Float[Array, " k"]
     converged: Bool[Array, " k"]
     rounding: Float[Array, " k"]
@@ -89,31 +99,55 @@ class Eigenpairs(eqx.Module):
     complete_below: Float[Array, ""]
     spectral_origin: Float[Array, ""]
     multiplet_tolerance: Float[Array, ""]
-    part: Int[Array, " k"] | None
-    frame: Float[Array, "k n_dof"]
+    problems: "tuple[PencilEigenpairs, ...]"
     pencil: AnyPencil
-    solver_name: str = eqx.field(static=True)
+    solver_name: str
+    k: int
+
+    @abstractmethod
+    def with_problems(self, problems: "Iterable[PencilEigenpairs]") -> "Eigenpairs":
+        """Return eigenpairs of other problems."""
+
+    @abstractmethod
+    def keeping(self, kept: Bool[Array, " k"]) -> "Eigenpairs":
+        """Keep only the marked pairs, the lowest ones; signatures then ignore the other pairs."""
+
+    @abstractmethod
+    def merged(self, values: Sequence[Any]) -> Array:
+        """Return the values (…, k) for each pair, given those for the pairs of each problem."""
+
+    def of_even(self, values: Float[Array, "*leading k0"] | Bool[Array, " k0"]) -> Array:
+        """Return values (…, k) for each pair, given those for the pairs of the first problem; 0 for all other pairs."""
+        odd = [jax_array(np.zeros((*values.shape[:-1], each.k), values.dtype)) for each in self.problems[1:]]
+        return self.merged([values, *odd])
+
+    @property
+    def problem_numbers(self) -> Int[Array, " k"]:
+        """The number of the problem that each pair belongs to: 0 for the even one."""
+        return self.merged([jax_array(np.full(each.k, i)) for i, each in enumerate(self.problems)])
 
     def __repr__(self) -> str:
-        unknowns = sum(part.space.n_dof for part in self.pencil.parts)
         return (
-            f"Eigenpairs(k={self.k} of {unknowns}, eigenvalues {describe_array(self.eigenvalues)}, "
-            f"vectors {describe_array(self.frame)}, solver_name={self.solver_name!r})"
+            f"Eigenpairs(k={self.k} of {self.n_unknowns}, eigenvalues {describe_array(self.eigenvalues)}, "
+            f"vectors {describe_array(self.vectors)}, solver_name={self.solver_name!r})"
         )
 
     @property
-    def vectors(self) -> Float[Array, "k n_dof"]:
-        """The coefficients of the eigenfunctions, with φᵢᵀMφⱼ = δᵢⱼ.
+    def _pencils(self) -> list[Pencil]:
+        return [each.pencil for each in self.problems if each.pencil is not None]
 
-        For the boundaries "mirror" and "mean", M is the mass of the domain doubled m times; on the domain itself, the
-        norm of each φᵢ is 1/√2ᵐ. The derivative of a vector is NaN unless its eigenvalue is simple and kept.
+    @property
+    def n_unknowns(self) -> int:
+        """The number of all eigenvalues of the matrices."""
+        return sum(pencil.size for pencil in self._pencils)
+
+    def truncated(self, k: int, multiplet: MultipletChoice) -> "Eigenpairs":
+        """Keep the lowest k pairs, or a different number if the cut would split a multiple eigenvalue.
+
+        ``"report"`` keeps exactly k. If k cuts a multiple eigenvalue, ``"drop"`` excludes its pairs, unless no pair
+        would remain; ``"complete"`` includes all its pairs if they were computed, and otherwise excludes them.
         """
-        if self.pencil is None:
-            return self.frame
-        values, following = jax.lax.stop_gradient((self.eigenvalues, self.next_eigenvalue))
-        among = np.ones((self.k, self.k), bool)
-        vectors = with_rotations(self.frame, values, among, self.part, self.pencil)
-        return of_simple(vectors, values, following, self.kept, self.part, self.pencil)
+        return self.keeping(kept_of(self._spectrum, k, multiplet))
 
     @property
     def eigenfunctions(self) -> Float[Array, "k *shape"]:
@@ -121,36 +155,15 @@ class Eigenpairs(eqx.Module):
         return self.space.extend(self.at_nodes)
 
     @property
-    def at_nodes(self) -> Float[Array, "k n_dof"]:
-        """The eigenfunctions' values at the free nodes: `vectors`, unless the quadrature is ``"cancelling"``."""
-        return self.pencil.read(self.vectors, self.part)
-
-    @property
     def space(self) -> FunctionSpace:
         """The function space of the eigenfunctions."""
         return self.pencil.space
 
     @property
-    def k(self) -> int:
-        """The number of pairs."""
-        return self.eigenvalues.shape[-1]
-
-    def of_part(self, number: int) -> "Eigenpairs":
-        """Keep only the pairs of one part of a doubled domain; signatures then ignore the other pairs."""
-        return self if self.part is None else eqx.tree_at(lambda p: p.kept, self, self.kept & (self.part == number))
-
-    def on(self, pencil: AnyPencil) -> "Eigenpairs":
-        """Return the pairs on another pencil that has the same nodes but other free nodes; see `on_all_nodes`."""
-        if pencil is self.pencil:
-            return self
-        frame = self.space.transfer(self.frame, pencil.space)
-        return eqx.tree_at(lambda p: (p.frame, p.pencil), self, (frame, pencil))
-
-    @property
     def null_space_known(self) -> bool:
         """Whether the pencils' null spaces are known."""
         # `Eigenpairs` in the outcome of a fit have no pencil. A fit is for a tensor field, whose null space is known.
-        return self.pencil is None or all(part.null_space is not None for part in self.pencil.parts)
+        return all(pencil.null_space is not None for pencil in self._pencils)
 
     @property
     def n_null(self) -> int:
@@ -160,7 +173,7 @@ class Eigenpairs(eqx.Module):
             ValueError: values are traced and the null space is unknown.
         """
         if self.null_space_known:
-            return min(self.k, sum(part.n_null for part in self.pencil.parts))
+            return min(self.k, sum(pencil.n_null for pencil in self._pencils))
         values = jax.lax.stop_gradient(self.eigenvalues)
         if is_traced(values):
             raise ValueError(
@@ -172,21 +185,22 @@ class Eigenpairs(eqx.Module):
     @property
     def cut_multiplet(self) -> Array:
         """The number of kept pairs of the multiple eigenvalue that the cut divides; 0 if the cut divides none."""
-        return _cut_multiplet(self._spectrum, self.kept)
+        return number_cut(self._spectrum, self.kept)
 
     @property
     def multiplets(self) -> Int[Array, " k"]:
         """The number of the multiple eigenvalue that each eigenvalue belongs to, from 0, as `cut_multiplet` tells."""
-        return _multiplets(self._spectrum)
+        return numbered(self._spectrum)
 
     @property
-    def _spectrum(self) -> "_Spectrum":
+    def _spectrum(self) -> Spectrum:
         # A known null space makes the lowest eigenvalues exact, and the distance of the others from zero is accurate.
-        parts = () if self.pencil is None else self.pencil.parts
-        unknown = [indistinct(part, self.eigenvalues.dtype) for part in parts if part.null_space is None]
-        rounding = jnp.max(jnp.stack(unknown)) if unknown else jnp.zeros((), self.eigenvalues.dtype)
-        known = self.eigenvalues, self.next_eigenvalue, self.spectral_origin, self.multiplet_tolerance, rounding
-        return _Spectrum(*jax.lax.stop_gradient(known))
+        pairs = jax.lax.stop_gradient(self)
+        values, unknown = pairs.eigenvalues, [pencil for pencil in pairs._pencils if pencil.null_space is None]
+        rounding = jnp.zeros((), values.dtype)
+        if unknown:
+            rounding = jnp.max(jnp.stack([indistinct(pencil, values.dtype) for pencil in unknown]))
+        return Spectrum(values, pairs.next_eigenvalue, pairs.spectral_origin, pairs.multiplet_tolerance, rounding)
 
     @property
     def unconfirmed(self) -> Bool[Array, ""]:
@@ -194,8 +208,8 @@ class Eigenpairs(eqx.Module):
 
         If a lower bound of the spectrum is known, no certificate is needed, because some solvers give none.
         """
-        optional = self.pencil is None or all(part.bounded for part in self.pencil.parts)
-        return _unconfirmed(self._spectrum, self.kept, jax.lax.stop_gradient(self.complete_below), optional)
+        optional = all(pencil.bounded for pencil in self._pencils)
+        return is_unconfirmed(self._spectrum, self.kept, jax.lax.stop_gradient(self.complete_below), optional)
 
     @property
     def uncertain(self) -> Bool[Array, " k"]:
@@ -205,7 +219,7 @@ class Eigenpairs(eqx.Module):
     @property
     def result(self) -> RESULTS:
         """The traceable code of the most serious failure, for a comparison with ``RESULTS.successful``."""
-        finite = _all_finite([leaf for leaf in jax.tree.leaves(self.pencil) if eqx.is_inexact_array(leaf)])
+        finite = _all_finite([leaf for leaf in jax.tree.leaves(self._pencils) if eqx.is_inexact_array(leaf)])
         code: Any = RESULTS  # mypy sees its members as strings
         result = code.where(jnp.any(self.uncertain), code.uncertain, code.successful)
         result = code.where(self.unconfirmed, code.unconfirmed, result)
@@ -248,7 +262,7 @@ class Eigenpairs(eqx.Module):
                 f"{of} of {values.size} eigenvalues (λ = {some}{', …' * (of > 3)}) are uncertain: rounding of the "
                 f"matrices to float32 changes them by up to {most:.1e}. Use float64{stated}"
             )
-        stretch = _anisotropy(self.pencil) if values.dtype == np.float32 else 1.0
+        stretch = _anisotropy(self._pencils) if values.dtype == np.float32 else 1.0
         if (rounding := np.finfo(np.float32).eps * stretch) > _ROUNDED:
             sentences.append(
                 f"the ratio of a tensor's eigenvalues is up to {stretch:.1e}: rounding such tensors to "
@@ -263,7 +277,7 @@ class Eigenpairs(eqx.Module):
         kept, following = int(np.asarray(self.kept).sum()), float(self.next_eigenvalue)
         last = values[kept - 1]
         lines = [
-            f"{self.k} eigenpairs of {sum(p.space.n_dof for p in self.pencil.parts)} by {self.solver_name}",
+            f"{self.k} eigenpairs of {self.n_unknowns} by {self.solver_name}",
             f"eigenvalues {values[0]:.6g} … {last:.6g} ({self.n_null} zero; the next is {following:.6g})",
             f"worst relative residual {np.max(residuals):.1e}; {int(np.sum(self.converged))} of {self.k} converged",
         ]
@@ -275,11 +289,89 @@ class Eigenpairs(eqx.Module):
         return "\n".join(lines + self.messages())
 
 
+def view(of: Callable[[Any], Any]) -> Any:
+    """Return a property in place of an attribute that a base class only declares."""
+    return property(of)
+
+
+class PencilEigenpairs(Eigenpairs, eqx.Module):
+    """The k lowest eigenpairs of one pencil.
+
+    Attributes:
+        frame: (k, n_dof) the values of `vectors`, but with a derivative that excludes rotations of eigenvectors among
+            themselves, which are singular at multiple eigenvalues. Derivatives of signatures include the effect of such
+            rotations by divided differences.
+    """
+
+    eigenvalues: Float[Array, " k"]
+    residuals: Float[Array, " k"]
+    converged: Bool[Array, " k"]
+    rounding: Float[Array, " k"]
+    kept: Bool[Array, " k"]
+    next_eigenvalue: Float[Array, ""]
+    complete_below: Float[Array, ""]
+    spectral_origin: Float[Array, ""]
+    multiplet_tolerance: Float[Array, ""]
+    frame: Float[Array, "k n_dof"]
+    pencil: Pencil
+    solver_name: str = eqx.field(static=True)
+
+    @view
+    def problems(self) -> "tuple[PencilEigenpairs, ...]":
+        """The pairs themselves, as the only problem."""
+        return (self,)
+
+    @view
+    def k(self) -> int:
+        """The number of pairs."""
+        return self.eigenvalues.shape[-1]
+
+    @view
+    def vectors(self) -> Float[Array, "k n_dof"]:
+        """The coefficients of the eigenfunctions; the derivative of a vector is NaN unless it is simple and kept."""
+        if self.pencil is None:
+            return self.frame
+        values, following = jax.lax.stop_gradient((self.eigenvalues, self.next_eigenvalue))
+        vectors = with_rotations(self.frame, values, self.pencil)
+        return of_simple(vectors, values, following, self.kept, self.pencil)
+
+    @view
+    def at_nodes(self) -> Float[Array, "k n_dof"]:
+        """The eigenfunctions' values at the free nodes."""
+        return self.pencil.read(self.vectors)
+
+    def with_problems(self, problems: "Iterable[PencilEigenpairs]") -> "PencilEigenpairs":
+        """Return the only problem."""
+        (problem,) = problems
+        return problem
+
+    def keeping(self, kept: Bool[Array, " k"]) -> "PencilEigenpairs":
+        """Keep only the marked pairs, the lowest ones."""
+        following = _first_beyond(kept, *jax.lax.stop_gradient((self.eigenvalues, self.next_eigenvalue)))
+        return eqx.tree_at(lambda p: (p.kept, p.next_eigenvalue), self, (kept, following))
+
+    def merged(self, values: Sequence[Any]) -> Array:
+        """Return the values of the only problem."""
+        return values[0]
+
+    def on(self, pencil: Pencil) -> "PencilEigenpairs":
+        """Return the pairs on another pencil that has the same nodes but other free nodes; see `on_all_nodes`."""
+        if pencil is self.pencil:
+            return self
+        frame = self.space.transfer(self.frame, pencil.space)
+        return eqx.tree_at(lambda p: (p.frame, p.pencil), self, (frame, pencil))
+
+
+@numpy_where_known()
+def _first_beyond(xp: Any, kept: Any, values: Any, following: Any) -> Any:
+    return xp.append(values, following)[xp.sum(kept)]
+
+
 def require_pairs(pairs: Eigenpairs) -> Eigenpairs:
     """Return the pairs; raise TypeError or ValueError unless they are eigenpairs of one domain."""
     if not isinstance(pairs, Eigenpairs):
         raise TypeError(f"pairs: got {type(pairs).__name__}; expected the result of `eigenpairs`")
-    if pairs.eigenvalues.ndim != 1:
+    if pairs.problems[0].eigenvalues.ndim != 1:
         raise ValueError(
             f"pairs: got a batch with eigenvalues of shape {pairs.eigenvalues.shape}; expected (k,). Use jax.vmap, or "
             "jax.tree.map(lambda x: x[i], pairs) for one of them"
@@ -287,9 +379,9 @@ def require_pairs(pairs: Eigenpairs) -> Eigenpairs:
     return pairs
 
 
-def _anisotropy(pencil: AnyPencil | None) -> float:
+def _anisotropy(pencils: list[Pencil]) -> float:
     """Return a high quantile of the tensors' eigenvalue ratios in a sample of the grid; 1 if there is no grid."""
-    metric = None if pencil is None else pencil.parts[0].metric
+    metric = pencils[0].metric if pencils else None
     if metric is None or metric.spacing is None or not getattr(metric.tensors, "is_fully_addressable", True):
         return 1.0
     tensors, d = metric.tensors, metric.tensors.shape[-1]
@@ -309,85 +401,3 @@ def _uncertain(xp: Any, kept: Any, rounding: Any, values: Any) -> Any:
 @numpy_where_known()
 def _all_finite(xp: Any, arrays: list[Any]) -> Any:
     return xp.all(xp.stack([xp.all(xp.isfinite(array)) for array in arrays]))
-
-
-class _Spectrum(NamedTuple):
-    """Computed eigenvalues, and the numbers that decide which of them count as equal; constants in derivatives."""
-
-    values: Any  # (k,) the eigenvalues, ascending
-    following: Any  # the next eigenvalue
-    origin: Any  # `Eigenpairs.spectral_origin`
-    tolerance: Any  # `Eigenpairs.multiplet_tolerance`
-    rounding: Any  # the rounding error of eigenvalues if no null space is known, otherwise 0
-
-
-# If no null space is known, the origin is the lowest computed eigenvalue, so distances from it do not show the rounding
-# errors of its copies. Copies differ by the rounding error of the matrix. In single precision on fine grids, this worst
-# case exceeds the gaps of distinct eigenvalues, whose errors are smaller. So rounding counts only up to a thousandth of
-# the spectrum's length, unless all eigenvalues are equal within rounding.
-def _gaps(xp: Any, spectrum: _Spectrum) -> Any:
-    """Return, for each eigenvalue, the largest gap to the next one at which the two count as equal, (k)."""
-    values, _, origin, tolerance, rounding = spectrum
-    finfo, length = jnp.finfo(values.dtype), xp.nanmax(values, initial=-xp.inf) - origin
-    rounding = xp.where(length <= rounding, rounding, xp.minimum(rounding, length / 1000))
-    stored = 4 * finfo.eps * xp.abs(values)
-    return xp.maximum(xp.maximum(tolerance * (values - origin), stored), xp.maximum(rounding, finfo.tiny))
-
-
-@numpy_where_known(static_argnums=3)
-def _unconfirmed(xp: Any, spectrum: _Spectrum, kept: Any, bound: Any, optional: bool) -> Any:
-    last = xp.sum(kept) - 1
-    # The solver may have shifted the matrix, which increases rounding, and counts outside of the copies' errors.
-    needed = spectrum.values[last] - 2 * _gaps(xp, spectrum._replace(rounding=16 * spectrum.rounding))[last]
-    return bound < needed if optional else ~(bound >= needed)
-
-
-@numpy_where_known()
-def _cut_multiplet(xp: Any, spectrum: _Spectrum, kept: Any) -> Any:
-    count = xp.sum(kept)
-    ends, index = _ends_of_multiplets(xp, spectrum), xp.arange(len(kept))
-    beyond = xp.append(spectrum.values, spectrum.following)[count]
-    whole = ends[count - 1] | xp.isnan(beyond - spectrum.values[count - 1])  # pairs that were not found are NaN
-    return xp.where(whole, 0, count - xp.max(xp.where(ends & (index < count), index + 1, 0)))
-
-
-@numpy_where_known()
-def _multiplets(xp: Any, spectrum: _Spectrum) -> Any:
-    ends = _ends_of_multiplets(xp, spectrum).astype(xp.int32)
-    return xp.cumsum(ends, dtype=xp.int32) - ends
-
-
-def _ends_of_multiplets(xp: Any, spectrum: _Spectrum) -> Any:
-    """Return the mask (k) of eigenvalues that differ from the next one."""
-    return xp.diff(xp.append(spectrum.values, spectrum.following)) > _gaps(xp, spectrum)
-
-
-MultipletChoice = Literal["report", "drop", "complete"]
-
-SPARE = 8
-"""The number of pairs beyond k that are computed to complete a multiple eigenvalue."""
-
-
-def truncate(pairs: Eigenpairs, k: int, multiplet: MultipletChoice) -> Eigenpairs:
-    """Keep the lowest k pairs, or a different number if the cut would split a multiple eigenvalue.
-
-    ``"report"`` keeps exactly k. If k cuts a multiple eigenvalue, ``"drop"`` excludes its pairs, unless no pair would
-    remain; ``"complete"`` includes all its pairs if they were computed, and otherwise excludes them.
-    """
-    chosen = _choose(pairs._spectrum, k, multiplet)
-    return eqx.tree_at(lambda p: (p.kept, p.next_eigenvalue), pairs, chosen)
-
-
-@numpy_where_known(static_argnums=(1, 2))
-def _choose(xp: Any, spectrum: _Spectrum, k: int, multiplet: MultipletChoice) -> tuple[Any, Any]:
-    size, ends = len(spectrum.values), _ends_of_multiplets(xp, spectrum)
-    index = xp.arange(size)
-    if multiplet == "report":
-        count = xp.asarray(k)
-    else:
-        count = xp.max(xp.where(ends & (index < k), index + 1, 0))
-        if multiplet == "complete":
-            more = xp.min(xp.where(ends & (index >= k - 1), index + 1, size + 1))
-            count = xp.where(more <= size, more, count)
-        count = xp.where(count > 0, count, k)
-    return index < count, xp.append(spectrum.values, spectrum.following)[count]

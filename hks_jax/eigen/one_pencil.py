@@ -1,6 +1,5 @@
 """The lowest eigenpairs of one pencil, with residuals and convergence flags."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,23 +11,22 @@ from jaxtyping import Array, Float
 from hks_jax.arrays import jax_array
 from hks_jax.compilation import is_concrete_on_cpu, numpy_where_known
 from hks_jax.eigen.derivative import solved
-from hks_jax.eigen.eigenpairs import UNCERTAIN, Eigenpairs
+from hks_jax.eigen.eigenpairs import UNCERTAIN, PencilEigenpairs
 from hks_jax.eigen.quality import allowed_residuals, indistinct, largest, largest_of, measure_pairs, measured_on_host
 from hks_jax.eigen.solver import Dense, Eigensolver, Report
 from hks_jax.fem.nodal import on_all_nodes
-from hks_jax.fem.pencil import AnyPencil, Pencil
+from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import MatrixSpace
 from hks_jax.linear.host_matrices import balanced, near_zero
 from hks_jax.linear.symmetric_pencil import SymmetricPencil, tabulated
 
 
-def widened(pencil: AnyPencil, solvers: Sequence[Eigensolver], k: int) -> AnyPencil:
-    """Return the pencil `on_all_nodes`, so that all masks share compiled code; unchanged for the dense solver."""
-    return pencil if any(isinstance(solver, Dense) for solver in solvers) else on_all_nodes(pencil, k)
-
-
-def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw: bool, report: Report) -> Eigenpairs:
+def pairs_of_pencil(
+    pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw: bool, report: Report
+) -> PencilEigenpairs:
     """Return the k lowest pairs and, if ``extra`` = 1, the next eigenvalue. See `solved` for ``throw``."""
+    # Iterative solvers compute on all nodes, so that all masks share compiled code.
+    given, pencil = pencil, pencil if isinstance(solver, Dense) else on_all_nodes(pencil, k + extra)
     solver.require(pencil)
     pencil, n_dof, most = _with_balance(pencil), pencil.size, solver.max_pairs(pencil.size)
     if k + extra > most and pencil.null_space is None:
@@ -42,7 +40,7 @@ def solve_lowest(pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw:
             f"k: got {k}, for which {k + extra} pairs are needed (one more shows where the spectrum is cut); the "
             f"{solver.name} solver computes at most {most} of {n_dof} pairs. Use a smaller k or the dense solver"
         )
-    return _pairs(pencil, solved(solver, pencil, k, extra, throw, report), solver)
+    return _pairs(pencil, solved(solver, pencil, k, extra, throw, report), solver).on(given)
 
 
 def _with_balance(pencil: Pencil) -> Pencil:
@@ -58,8 +56,8 @@ def _single_on_host(values: Any, args: Any) -> bool:
     return values.dtype == np.float32 and is_concrete_on_cpu(args)
 
 
-def _pairs(pencil: Pencil, found: tuple[Any, ...], solver: Eigensolver) -> Eigenpairs:
-    """Return the `Eigenpairs` of a pencil, given the result of `solved`."""
+def _pairs(pencil: Pencil, found: tuple[Any, ...], solver: Eigensolver) -> PencilEigenpairs:
+    """Return the `PencilEigenpairs` of a pencil, given the result of `solved`."""
     values, frame, following, bound = found
     known, double = pencil.null_space is not None, solver.in_double
     constants = jax.lax.stop_gradient((pencil, frame, values, following))
@@ -72,7 +70,7 @@ def _pairs(pencil: Pencil, found: tuple[Any, ...], solver: Eigensolver) -> Eigen
     if not known:
         values = _with_small(values, constants[2], zero, small)
     # While differentiating, JAX may turn a constant array into a Python number.
-    return Eigenpairs(
+    return PencilEigenpairs(
         eigenvalues=values,
         residuals=residuals,
         converged=converged,
@@ -82,7 +80,6 @@ def _pairs(pencil: Pencil, found: tuple[Any, ...], solver: Eigensolver) -> Eigen
         complete_below=jax_array(bound),
         spectral_origin=jnp.zeros((), values.dtype) if known else jax.lax.stop_gradient(values[0]),
         multiplet_tolerance=tolerance,
-        part=None,
         frame=frame,
         pencil=pencil,
         solver_name=solver.name,

@@ -5,23 +5,18 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from hks_jax.compilation import numpy_where_known
 from hks_jax.eigen.adjoints.complement import OfRows, Rows, Scalar, Values
 from hks_jax.eigen.quality import indistinct
-from hks_jax.fem.pencil import AnyPencil, Pencil
-from hks_jax.fem.space import FunctionSpace
+from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.linear_map import first_order_only, with_transpose
 from hks_jax.linear.linear_program import linear_program
 from hks_jax.linear.products import even_size, inner_products, matmul, row_blocks
 
 _ROWS = 128
 """The number of eigenvectors whose products with all others are computed at once, which limits the memory."""
-
-Part = Int[Array, " k"] | None
-Among = Bool[Array | np.ndarray, "k k"]
 
 
 # With fᵢ = (dK − λᵢ dM) φᵢ, the derivative of an eigenvector has the component
@@ -35,35 +30,23 @@ Among = Bool[Array | np.ndarray, "k k"]
 # simple: `of_simple` replaces the other derivatives by NaN. Spectral functions do not depend on the basis, so their
 # derivatives must not contain gauge components, and use the frame instead (hks_jax/signatures/spectral_functions.py).
 @jax.custom_jvp
-def with_rotations(frame: Rows, values: Values, among: Among, part: Part, pencil: AnyPencil) -> Rows:
-    """Return the frame, with a derivative that includes rotations of φᵢ towards φⱼ where ``among`` marks (i, j).
-
-    Under "mirror" and "mean", ``part`` has the number of each eigenvector's pencil; eigenvectors of different pencils
-    do not mix.
-    """
+def with_rotations(frame: Rows, values: Values, pencil: Pencil) -> Rows:
+    """Return the frame, with a derivative that includes rotations of the eigenvectors among themselves."""
     return frame
 
 
 @with_rotations.defjvp
 def _with_rotations_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    frame, values, among, part, pencil = first_order_only(primals)
-    tangent, change = tangents[0], tangents[4]
-    for number, (each, moved) in enumerate(zip(pencil.parts, change.parts, strict=True)):
-        own = among if part is None else among & (part == number)[:, None] & (part == number)[None]
-        rounding = indistinct(each, values.dtype)
-        known = frame, values, own, rounding, pencil.space
-        tangent = tangent + linear_program(_rotations, (len(pencil.parts),), known, moved, frame)
-    return frame, tangent
+    frame, values, pencil = first_order_only(primals)
+    known = frame, values, indistinct(pencil, values.dtype)
+    return frame, tangents[0] + linear_program(_rotations, (), known, tangents[2], frame)
 
 
-@partial(jax.checkpoint, static_argnums=0)
-def _rotations(
-    copies: int, frame: Rows, values: Values, among: Among, rounding: Scalar, space: FunctionSpace, change: Pencil
-) -> Rows:
-    stiffness, mass = changes_between(frame, space, copies, change)
+@jax.checkpoint
+def _rotations(frame: Rows, values: Values, rounding: Scalar, change: Pencil) -> Rows:
+    stiffness, mass = changes_between(frame, change)
     apart, inverse = gaps(jnp, values, len(values), rounding)
-    components = jnp.where(apart, inverse * (stiffness - values[:, None] * mass), -mass / 2)
-    return matmul(jnp.where(among, components, 0), frame)
+    return matmul(jnp.where(apart, inverse * (stiffness - values[:, None] * mass), -mass / 2), frame)
 
 
 def gaps(xp: Any, values: Any, k: int, rounding: Any) -> tuple[Any, Any]:
@@ -74,18 +57,15 @@ def gaps(xp: Any, values: Any, k: int, rounding: Any) -> tuple[Any, Any]:
     return apart, xp.where(apart, 1 / xp.where(apart, gap, 1), 0)
 
 
-def changes_between(
-    vectors: Rows, space: FunctionSpace, copies: int, change: Pencil
-) -> tuple[Float[Array, "k k"], Float[Array, "k k"]]:
-    """Return φᵢᵀ dK φⱼ and φᵢᵀ dM φⱼ on the domain that is doubled ``copies`` times, for vectors on ``space``."""
+def changes_between(vectors: Rows, change: Pencil) -> tuple[Float[Array, "k k"], Float[Array, "k k"]]:
+    """Return φᵢᵀ dK φⱼ and φᵢᵀ dM φⱼ."""
     size = even_size(len(vectors), _ROWS)
     starts, place = row_blocks(len(vectors), size)
 
     @jax.checkpoint  # reverse mode would otherwise store a copy of the vectors
     def products(start: Array) -> list[Float[Array, "size k"]]:
-        own = space.transfer(jax.lax.dynamic_slice_in_dim(vectors, start, size), change.space)
-        images = (change.space.transfer(matrix.apply(own), space) for matrix in (change.stiffness, change.mass))
-        return [copies * products_with_constants(image, vectors) for image in images]
+        own = jax.lax.dynamic_slice_in_dim(vectors, start, size)
+        return [products_with_constants(matrix.apply(own), vectors) for matrix in (change.stiffness, change.mass)]
 
     stiffness, mass = (blocks[place] for blocks in jax.lax.map(products, jnp.asarray(starts)))
     return stiffness, mass
@@ -98,9 +78,7 @@ def products_with_constants(images: Float[Array, "b n_dof"], vectors: Rows) -> F
 
 
 @jax.custom_jvp
-def of_simple(
-    vectors: Rows, values: OfRows, following: Scalar, kept: Bool[Array, " k"], part: Any, pencil: AnyPencil
-) -> Rows:
+def of_simple(vectors: Rows, values: OfRows, following: Scalar, kept: Bool[Array, " k"], pencil: Pencil) -> Rows:
     """Return the vectors. A nonzero derivative of a vector becomes NaN unless its eigenvalue is simple and kept."""
     return vectors
 
@@ -110,9 +88,8 @@ def of_simple(
 # change the sum of their φᵢ(x)². So no finite derivative of eigenvectors gives the terms with i ≠ j.
 @of_simple.defjvp
 def _of_simple_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    vectors, values, following, kept, part, pencil = primals
-    rounding = [indistinct(each, values.dtype) for each in pencil.parts]
-    multiple = _is_multiple(values, following, kept, part, rounding, pencil.parts[0].n_fixed > 0)
+    vectors, values, following, kept, pencil = primals
+    multiple = _is_multiple(values, following, kept, indistinct(pencil, values.dtype), pencil.n_fixed > 0)
 
     def undefined(x: Rows) -> Rows:
         return jnp.where((multiple & jnp.any(x != 0, axis=1))[:, None], jnp.nan, x)
@@ -120,13 +97,11 @@ def _of_simple_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     return vectors, with_transpose(undefined, undefined, tangents[0])
 
 
-@numpy_where_known(static_argnums=5)
-def _is_multiple(xp: Any, values: Any, following: Any, kept: Any, part: Any, rounding: Any, fixed: bool) -> Any:
+@numpy_where_known(static_argnums=4)
+def _is_multiple(xp: Any, values: Any, following: Any, kept: Any, rounding: Any, fixed: bool) -> Any:
     """Return the mask (k) of pairs that are not kept or whose eigenvalue is multiple, except fixed null vectors."""
     size = xp.maximum(xp.abs(values), values - values[:1])
-    least = xp.maximum(xp.finfo(values.dtype).eps ** 0.5 * size, xp.max(xp.stack(rounding)))
+    least = xp.maximum(xp.finfo(values.dtype).eps ** 0.5 * size, rounding)
     near = xp.abs(values[:, None] - values[None]) <= least[:, None]
-    if part is not None:
-        near &= part[:, None] == part[None]
     mixed = (xp.sum(near, axis=1) > 1) & ~((values == 0) & fixed)  # perturbations do not change fixed null vectors
     return mixed | (following - values <= least) | ~kept

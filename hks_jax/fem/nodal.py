@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from hks_jax.domain.grid import Grid
 from hks_jax.fem.halo import Slabs
-from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
+from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import GridSpace, grid_space, mask_for
 from hks_jax.fem.stencil import Stencil, StencilOperator, coefficients_of
 from hks_jax.linear.chebyshev import chebyshev_iteration
@@ -159,20 +159,15 @@ free in 2D, computations on all nodes take 1.4 to 1.9 times as long as on the fr
 time that the shared compilation saves. In 3D the cost of a factorisation grows faster with the number of nodes."""
 
 
-def on_all_nodes(pencil: AnyPencil, k: int = 0) -> AnyPencil:
+def on_all_nodes(pencil: Pencil, k: int = 0) -> Pencil:
     """Return a pencil on all nodes of a grid with the same lowest eigenpairs, if that is faster.
 
     Each node i that is not free gets a separate equation, Kᵢᵢ = σMᵢᵢ, with an eigenvalue σ above the lowest quarter of
     the spectrum; the other eigenvectors vanish at node i. The pencil is returned unchanged if k, the number of wanted
     eigenpairs, exceeds a quarter of its size, or if it is traced, as `jax.jit` compiles code for each mask anyway.
     """
-    parts = tuple(_of_one(part) if 4 * k <= part.size else part for part in pencil.parts)
-    return parts[0] if isinstance(pencil, Pencil) else MirrorPencil(parts, pencil.including)
-
-
-def _of_one(pencil: Pencil) -> Pencil:
     space = pencil.space
-    if is_traced(jax.lax.stop_gradient(pencil.stiffness)) or not isinstance(space, GridSpace):
+    if 4 * k > pencil.size or is_traced(jax.lax.stop_gradient(pencil.stiffness)) or not isinstance(space, GridSpace):
         return pencil
     if not _FILLED[space.dimension] * space.free.size <= space.n_dof < space.free.size:
         return pencil

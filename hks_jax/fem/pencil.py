@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from hks_jax.arrays import jax_array
 from hks_jax.fem.fields import Field
@@ -77,7 +77,7 @@ class Pencil(SymmetricPencil):
             self.metric, self.space, isinstance(self.mass, DiagonalOperator), self.row_sums is not None
         )
 
-    def read(self, functions: Float[Array, "... n_dof"], part: Any = None) -> Float[Array, "... n_dof"]:
+    def read(self, functions: Float[Array, "... n_dof"]) -> Float[Array, "... n_dof"]:
         """Return the values of functions at the free nodes, given their unknowns (see `assemble`)."""
         return functions if self.row_sums is None else _read(self.mass, self.row_sums, functions)
 
@@ -151,20 +151,6 @@ class MirrorPencil(eqx.Module):
     def resolution(self) -> Resolution | None:
         """The effect of the node spacing on signatures, for error estimates; None if it is not known."""
         return self.parts[0].resolution
-
-    def read(self, functions: Float[Array, "k n_dof"], part: Int[Array, " k"] | None) -> Float[Array, "k n_dof"]:
-        """Return the values of functions at the free nodes, given their unknowns and each function's part."""
-        # At the free nodes of a part, the mass of the part equals the mass of the first part; at all other nodes, the
-        # functions of the part vanish.
-        sums = [
-            jnp.where(part.space.free, part.space.extend(part.row_sums, outside=0.0), jnp.inf)
-            for part in self.parts
-            if part.row_sums is not None
-        ]
-        if not sums:
-            return functions
-        whole = self.space.restrict(jnp.stack(sums))[part]
-        return jnp.where(jnp.isinf(whole), 0, functions + self.parts[0].mass.apply(functions) / whole) / 2
 
     @property
     def volume(self) -> Float[Array, ""] | None:

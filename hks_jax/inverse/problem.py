@@ -67,7 +67,9 @@ class Problem(eqx.Module):
         penalty = jnp.concatenate([jnp.zeros(0, data.dtype), *penalties])
         misfit = jnp.sum(data**2) / 2
         truncation = self.observation.truncation_misfit(pairs)
-        pairs = eqx.tree_at(lambda p: (p.frame, p.pencil), pairs, (None, None))
+        pairs = pairs.with_problems(
+            eqx.tree_at(lambda p: (p.frame, p.pencil), each, (None, None)) for each in pairs.problems
+        )
         nan = jnp.full((), jnp.nan, data.dtype)
         outcome = Outcome(misfit + jnp.sum(penalty**2) / 2, misfit, truncation, pairs, values, nan)
         return data, penalty, jax.lax.stop_gradient(outcome)
@@ -118,7 +120,10 @@ def discretisation_misfit(problem: Problem, outcome: Outcome) -> float:
     if observation.signature.left_out is None:
         return math.nan
     pencil = assemble(problem.unknowns.field(outcome.values), problem.boundary)
-    pairs = eqx.tree_at(lambda p: p.pencil, outcome.pairs, pencil, is_leaf=lambda x: x is None)
+    pairs = outcome.pairs.with_problems(
+        eqx.tree_at(lambda p: p.pencil, each, part, is_leaf=lambda x: x is None)
+        for each, part in zip(outcome.pairs.problems, pencil.parts, strict=True)
+    )
     times, which = np.unique(observation.observed_times, return_inverse=True)
     bias = truncation(pairs, times).resolution_bias[which]
     residuals = observation.root_weights * observation.loss((1 + bias) * observation.target, observation.target)

@@ -1,5 +1,6 @@
 """Save and load eigenpairs, so that signatures at other times need no new eigenvalue computation."""
 
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import fields
@@ -9,12 +10,13 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from hks_jax.eigen.eigenpairs import Eigenpairs
-from hks_jax.fem.pencil import AnyPencil
+from hks_jax.eigen.doubled import DoubledEigenpairs
+from hks_jax.eigen.eigenpairs import Eigenpairs, PencilEigenpairs
+from hks_jax.fem.pencil import AnyPencil, MirrorPencil
 from hks_jax.storage import load_npz, write_npz
 
-ARRAYS = "vectors", *(f.name for f in fields(Eigenpairs) if f.name not in ("frame", "pencil", "solver_name"))
-"""The fields of `hks_jax.Eigenpairs` that are saved as arrays, without `frame`, which equals `vectors`."""
+ARRAYS = "vectors", *(f.name for f in fields(PencilEigenpairs) if f.name not in ("frame", "pencil", "solver_name"))
+"""The attributes of `hks_jax.Eigenpairs` that are saved as arrays."""
 _FAR = 1e-3
 """The residual, relative to the largest known eigenvalue, above which pairs count as pairs of another pencil."""
 
@@ -39,7 +41,9 @@ def save_pairs(path: str | os.PathLike[str], pairs: Eigenpairs, extra: Mapping[s
     """
     if not os.fspath(path).endswith(".npz"):
         raise ValueError(f"path: got {os.fspath(path)!r}; expected a name that ends in .npz")
-    arrays = {name: np.asarray(getattr(pairs, name)) for name in ARRAYS if getattr(pairs, name) is not None}
+    arrays = {name: np.asarray(getattr(pairs, name)) for name in ARRAYS}
+    if len(pairs.problems) > 1:
+        arrays["part"] = np.asarray(pairs.problem_numbers)
     content: dict[str, Any] = {**arrays, "solver_name": pairs.solver_name, **(extra or {})}
     write_npz(path, content, compressed=False)
     return Path(path)
@@ -69,8 +73,8 @@ def load_pairs(path: str | os.PathLike[str], pencil: AnyPencil) -> Eigenpairs:
 
 def pairs_of(name: str, arrays: Mapping[str, np.ndarray], pencil: AnyPencil) -> Eigenpairs:
     """Return the eigenpairs in the arrays of the file `name`; see `load_pairs`."""
-    doubled = len(pencil.parts) > 1
-    names = [key for key in ARRAYS if (key != "part" or doubled) and (key != "rounding" or key in arrays)]
+    doubled = isinstance(pencil, MirrorPencil)
+    names = [key for key in (*ARRAYS, *["part"] * doubled) if key != "rounding" or key in arrays]
     missing = [key for key in (*names, "solver_name") if key not in arrays]
     if missing:
         raise ValueError(f"{name}: the file lacks {', '.join(missing)}; expected a file that save_pairs wrote")
@@ -86,12 +90,15 @@ def pairs_of(name: str, arrays: Mapping[str, np.ndarray], pencil: AnyPencil) -> 
             f"{name}: got eigenfunctions of shape {values['vectors'].shape}; expected {(k, n)} for this pencil. Use "
             "the mask and the boundary with which the pairs were computed"
         )
-    solver_name = str(np.asarray(arrays["solver_name"]))
-    values.setdefault("part", None)
     values.setdefault("rounding", jnp.zeros_like(values["eigenvalues"]))  # older files lack it
-    frame = values.pop("vectors")
-    pairs = Eigenpairs(**values, frame=frame, pencil=pencil, solver_name=solver_name)
-    gap = np.concatenate([_residuals(pairs, number) for number in range(len(pencil.parts))])
+    values["solver_name"] = str(np.asarray(arrays["solver_name"]))
+    pairs: Eigenpairs
+    if isinstance(pencil, MirrorPencil):
+        problems = (_of_problem(values, pencil, number) for number in range(len(pencil.parts)))
+        pairs = DoubledEigenpairs(tuple(problems), pencil.including, k)
+    else:
+        pairs = PencilEigenpairs(frame=values.pop("vectors"), pencil=pencil, **values)
+    gap = np.concatenate([_residuals(each) for each in pairs.problems])
     ends = np.array([pairs.next_eigenvalue, *pairs.eigenvalues[-1:], pairs.spectral_origin])
     size = np.max(np.abs(ends[np.isfinite(ends)]))
     worst = float(np.max(gap, initial=0)) / max(size, np.finfo(ends.dtype).tiny)
@@ -103,11 +110,17 @@ def pairs_of(name: str, arrays: Mapping[str, np.ndarray], pencil: AnyPencil) -> 
     return pairs
 
 
-def _residuals(pairs: Eigenpairs, number: int) -> np.ndarray:
-    """Return ‖Kφ − λMφ‖ / ‖Mφ‖ for the pairs of one pencil of `pencil.parts`."""
-    part = pairs.pencil.parts[number]
-    own = slice(None) if pairs.part is None else np.flatnonzero(np.asarray(pairs.part) == number)
-    vectors = pairs.space.transfer(pairs.vectors[own], part.space)
-    image = part.mass.apply(vectors)
-    left = part.stiffness.apply(vectors) - pairs.eigenvalues[own][:, None] * image
+def _of_problem(values: dict[str, Any], pencil: MirrorPencil, number: int) -> PencilEigenpairs:
+    """Return the pairs of one problem of a doubled domain, given the arrays of all its pairs."""
+    own, part = np.flatnonzero(values["part"] == number), pencil.parts[number]
+    # On the domain doubled m times, vectors have norm 1, hence norm 1/√2ᵐ on the domain itself.
+    frame = math.sqrt(len(pencil.parts)) * pencil.space.transfer(values["vectors"][own], part.space)
+    others = {key: x[own] if np.ndim(x) else x for key, x in values.items() if key not in ("vectors", "part")}
+    return PencilEigenpairs(frame=frame, pencil=part, **others)
+
+
+def _residuals(pairs: PencilEigenpairs) -> np.ndarray:
+    """Return ‖Kφ − λMφ‖ / ‖Mφ‖ for the pairs."""
+    image = pairs.pencil.mass.apply(pairs.frame)
+    left = pairs.pencil.stiffness.apply(pairs.frame) - pairs.eigenvalues[:, None] * image
     return np.asarray(jnp.linalg.norm(left, axis=1) / jnp.linalg.norm(image, axis=1))

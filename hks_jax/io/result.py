@@ -186,6 +186,11 @@ class Result:
         return str(self.settings.get("normalisation", "raw"))
 
     @property
+    def centre(self) -> float | None:
+        """The value of a flat metric, 1 with the normalisation ``"flat"``; None with the others."""
+        return 1.0 if self.name == "hks" and self.normalisation == "flat" else None
+
+    @property
     def tensors(self) -> Float[np.ndarray, "*shape d d"] | None:
         """The tensors of a volume or slice; None for a mesh, and if the file of the result has none."""
         known = isinstance(self.place, TensorVolume) and not (self.source and "input_tensors" not in self.arrays)

@@ -66,7 +66,7 @@ def save_figure(fig: Figure, path: str | os.PathLike[str], *, dpi: float = 150) 
 def finished(fig: Figure, suptitle: str, path: str | os.PathLike[str] | None = None) -> Figure:
     """Add a title to a figure, save it if a path is given, and return it."""
     if suptitle:
-        fig.suptitle(suptitle)
+        fig.suptitle(suptitle, fontsize="medium")
     if path is not None:
         save_figure(fig, path)
     return fig
@@ -157,11 +157,8 @@ def colour_bar_in(
     bar_axes: Axes, mappable: ScalarMappable, label: str = "", values: np.ma.MaskedArray | None = None, **kwargs: Any
 ) -> Colorbar:
     """Draw a colour bar in separate axes, with few ticks, powers of ten, and arrows if values exceed its range."""
-    low, high = mappable.get_clim()
     drawn: Any = mappable.get_array() if values is None else values
-    rounding = 1e-6 * (high - low)  # a range that is symmetric about a centre ends near the least value
-    extend = ("neither", "min", "max", "both")[(drawn.min() < low - rounding) + 2 * (drawn.max() > high + rounding)]
-    bar = figure_of(bar_axes).colorbar(mappable, cax=bar_axes, extend=extend, **kwargs)
+    bar = figure_of(bar_axes).colorbar(mappable, cax=bar_axes, extend=arrows(mappable, drawn), **kwargs)
     formatter = ScalarFormatter(useOffset=False, useMathText=True)
     formatter.set_powerlimits((-3, 4))
     if "format" not in kwargs and "ticks" not in kwargs:
@@ -174,6 +171,18 @@ def colour_bar_in(
     if label:
         bar.set_label(label, fontsize=SMALL)
     return bar
+
+
+def arrows(mappable: ScalarMappable, drawn: Any) -> str:
+    """Return the ends of a colour bar that have arrows, because drawn values exceed its range."""
+    low, high = mappable.get_clim()
+    rounding = 1e-6 * (high - low)  # a range that is symmetric about a centre ends near the least value
+    return ("neither", "min", "max", "both")[(drawn.min() < low - rounding) + 2 * (drawn.max() > high + rounding)]
+
+
+def lines_in(text: str) -> int:
+    """Return the number of lines of a title; an empty title has none."""
+    return text.count("\n") + 1 if text else 0
 
 
 def number_text(value: float) -> str:

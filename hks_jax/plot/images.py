@@ -29,7 +29,9 @@ FADED_NOTE = (
 )
 """The legend of pictures with faded values."""
 FAR = 1.5
-"""If the median of nonnegative values exceeds 1.5 times the centre, the colour range is not centred."""
+"""If nine tenths of nonnegative values exceed 1.5 times the centre, the colour range is not centred."""
+DIVERGING = "RdBu_r"
+"""The colour map about a centre, with red above and blue below."""
 RULES = ("quantiles", "least_range", "centre", "vmin", "vmax")
 """The arguments of `scalar_image` that determine the values of the first and the last colour."""
 
@@ -63,7 +65,8 @@ def scalar_image(
         vmax: the value of the last colour, by default from `quantiles`.
         centre: the value of the middle colour unless vmin and vmax are given, such as 1, the value of 4πt·HKS for a
             flat metric. The colour range is symmetric about the centre, but does not extend below 0 if no value is
-            negative. The argument `centre` is ignored if no value is negative and most values are far above the centre.
+            negative. The argument `centre` is ignored if no value is negative and nine tenths of the values exceed 1.5
+            times the centre.
         quantiles: the quantiles of the values that get the first and the last colour, unless vmin and vmax are given.
             The colour bar has arrows if other values lie beyond its ends.
         least_range: the least difference between the values of the first and the last colour, relative to the larger
@@ -195,7 +198,7 @@ def colours_of(
     if np.shape(quantiles) != (2,) or not 0 <= quantiles[0] < quantiles[1] <= 1:
         raise ValueError(f"quantiles: got {quantiles}; expected two increasing numbers from 0 to 1")
     everything = np.concatenate([image.ravel() for image in images])
-    if centre is not None and everything.min() >= 0 and np.median(everything) > FAR * centre > 0:
+    if centre is not None and everything.min() >= 0 and np.quantile(everything, 0.1) > FAR * centre > 0:
         centre = None
     colours = []
     for values in images:
@@ -207,7 +210,7 @@ def colours_of(
             low, high = centre - reach, centre + reach
         lacking = least_range * (max(abs(low), abs(high)) or 1.0) - (high - low)
         low, high = low - max(lacking, 0) / 2, high + max(lacking, 0) / 2
-        cmap = "viridis" if centre is None else "RdBu_r"
+        cmap = "viridis" if centre is None else DIVERGING
         colours.append(Colours(low if vmin is None else vmin, high if vmax is None else vmax, cmap))
     return colours
 
@@ -224,6 +227,8 @@ def panel_colours(
     follows from the values of the image or, if `shared` is True, from the values of all images.
     """
     rules, cmap = {name: kwargs.pop(name) for name in RULES if name in kwargs}, kwargs.pop("cmap", None)
+    if not images:
+        return []
     if limits is not None:
         if np.shape(limits) != (len(images), 2):
             raise ValueError(f"limits: got shape {np.shape(limits)}; expected {(len(images), 2)}, a pair per time")

@@ -14,9 +14,14 @@ from matplotlib.figure import Figure
 from hks_jax.arrays import describe_array
 from hks_jax.checks import require_real
 from hks_jax.domain.grid import Grid
-from hks_jax.plot.figure import SMALL, finished, new_figure, number_text, panel_size, require_plane
+from hks_jax.plot.figure import SMALL, finished, lines_in, new_figure, number_text, panel_size, require_plane
 from hks_jax.plot.images import masked, panel_colours, scalar_image
 from hks_jax.plot.orientation import Orientation
+
+LINE = 0.18
+"""The height of a line of a title, in inches."""
+BESIDE: dict[str, Any] = {"cmap": "gray", "quantiles": (0.01, 0.99)}
+"""The style of scalars beside a signature, which show the anatomy; their extreme values, as of fluid, are cut."""
 
 
 def hks_panels(
@@ -26,8 +31,10 @@ def hks_panels(
     *,
     titles: Sequence[str] | None = None,
     unit: str = "",
+    length_unit: str = "",
     shared_range: bool = False,
     limits: Sequence[tuple[float, float]] | None = None,
+    beside: Mapping[str, Real[ArrayLike, "nx ny"]] | None = None,
     path: str | os.PathLike[str] | None = None,
     suptitle: str = "",
     orientation: Orientation | None = None,
@@ -43,8 +50,10 @@ def hks_panels(
         grid: the 2D grid of the values.
         titles: a title for each time, by default “t = …”.
         unit: the unit of t, which titles show after the value of t.
+        length_unit: the unit of the coordinates, which the axes show.
         shared_range: whether all images use the colours of one range.
         limits: the values of the first and the last colour for each time.
+        beside: other scalars (*shape,) by title, such as the mean diffusivity, drawn in grey after the last time.
         path: the file in which to save the figure, if given.
         suptitle: the figure's title.
         orientation: the same as for `scalar_image`.
@@ -66,19 +75,28 @@ def hks_panels(
     titles = panel_titles(t, titles, unit)
     images = [masked("values", v, grid) for v in np.ma.asarray(values)]
     colours = panel_colours(images, limits, shared_range, **kwargs)
-    rows = math.ceil(t.size / 4)
-    columns = math.ceil(t.size / rows)
-    width, height = panel_size(grid if orientation is None else orientation.grid(grid), 2.6, 5.0)
-    fig = new_figure(columns * (width + 1.0) + 0.4, rows * (height + 0.45) + 0.3 + 0.3 * bool(suptitle))
-    noise, lines = ([None] * t.size if each is None else np.asarray(each) for each in (z, hatched))
+    others = [masked(f"beside: {title}", each, grid) for title, each in (beside or {}).items()]
+    images, colours = [*images, *others], [*colours, *panel_colours(others, **BESIDE)]
+    titles, n = [*titles, *(beside or {})], len(images)
+    rows = math.ceil(n / 4)
+    columns = math.ceil(n / rows)
+    width, height = panel_size(grid if orientation is None else orientation.grid(grid), 2.3, 5.0)
+    over = LINE * (rows * max(map(lines_in, titles)) + lines_in(suptitle))
+    bar = 0.65 + 0.25 * bool(kwargs.get("label"))
+    axes = 0.2 * bool(length_unit)
+    fig = new_figure(columns * (width + bar) + 0.3 + axes, rows * (height + 0.15) + 0.35 + axes + over)
+    noise, lines = ([None] * n if each is None else [*np.asarray(each), *[None] * len(others)] for each in (z, hatched))
     panels = fig.subplots(rows, columns, squeeze=False).ravel()
-    for ax in panels[t.size :]:
+    for ax in panels[n:]:
         ax.remove()
-    for index, ax in enumerate(panels[: t.size]):
+    for index, ax in enumerate(panels[:n]):
         masks: dict[str, Any] = {"z": noise[index], "hatched": lines[index]}
         scalar_image(ax, images[index], grid, orientation=orientation, **masks, **colours[index])
         ax.set_title(titles[index], fontsize="medium")
-        ax.tick_params(labelleft=index % columns == 0, labelbottom=index + columns >= t.size)
+        left, lowest = index % columns == 0, index + columns >= n
+        ax.tick_params(labelleft=left, labelbottom=lowest)
+        ax.set_ylabel(length_unit if left else "", fontsize=SMALL)
+        ax.set_xlabel(length_unit if lowest else "", fontsize=SMALL)
     return finished(fig, suptitle, path)
 
 

@@ -5,18 +5,19 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Real
 from matplotlib.figure import Figure
 from scipy import ndimage
 
-from hks_jax import Grid
+from hks_jax import Grid, SurfaceMesh, TetMesh
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result, require_result
 from hks_jax.io.units import MM2_PER_S
 from hks_jax.plot.figure import RIM_NOTE, number_text
-from hks_jax.plot.images import FADED, FADED_NOTE, Colours, colours_of
+from hks_jax.plot.images import DIVERGING, FADED, FADED_NOTE, Colours, colours_of
 from hks_jax.plot.orientation import Orientation, View
 from hks_jax.plot.panels import hks_panels, panel_titles
+from hks_jax.plot.surfaces import surface_panels
 from hks_jax.plot.volumes import volume_panels
 
 ENOUGH = 0.1
@@ -42,13 +43,15 @@ def signature_panels(
     through: tuple[int, int, int] | None = None,
     show_rim: bool = False,
 ) -> Figure:
-    """Return a figure of a signature on a slice, or on three slices of a volume, with separate colours for each time.
+    """Return a figure of a signature on a slice, on three slices of a volume, or on two sides of a mesh, for each time.
+
+    Each time has separate colours. The mean diffusivity, if it is known, is drawn in grey after the last time.
 
     The colour range contains nearly all values away from the boundary, and colour bars have arrows if other values
-    exceed the range. With "flat" normalisation the colours diverge from 1, the value for a flat metric, unless most
-    values are far above 1. Values that noise explains fade to grey, and titles contain the share of the nodes that are
-    not grey. Nodes at which the boundary contributes over a tenth of the signature are hatched, if `result.arrays` has
-    the influence. Titles contain diffusion lengths √(Dt), if known.
+    exceed the range; the title has the share of these values. With "flat" normalisation the colours diverge from 1, the
+    value for a flat metric, unless nine tenths of the values exceed 1.5. Values that noise explains fade to grey, and
+    titles contain the share of the nodes that are not grey. Nodes at which the boundary contributes over a tenth of the
+    signature are hatched, if `result.arrays` has the influence. Titles contain diffusion lengths √(Dt), if known.
 
     Args:
         result: the signature to draw.
@@ -59,7 +62,7 @@ def signature_panels(
         show_rim: whether nodes near the boundary are not hatched.
 
     Raises:
-        ValueError: if the result is on a mesh.
+        TypeError: if the result is no `hks_jax.io.Result`.
 
     Examples:
         >>> volume = hj.io.TensorVolume(np.array(field.tensors), field.grid.spacing, field.grid.origin)
@@ -68,16 +71,23 @@ def signature_panels(
         2
     """
     require_result(result)
+    near = None if show_rim else result.near_rim
+    if not isinstance(result.place, TensorVolume):
+        return _on_mesh(result, near, title, path)
     volume, inside = result.volume, np.isfinite(result.values[0])
     grid, box = cropped(volume, inside)
-    colours = _colours(result, inside)
-    near = None if show_rim else result.near_rim
+    nodes = inside if result.near_rim is not None else away_from_rim(inside)
+    colours = free_colours(result.values, result.near_rim, nodes, result.centre)
+    words = [title or caption(result), *legend(result, near), *range_notes(result, result.values, colours)]
     style: dict[str, Any] = {
         "titles": titles_of(result),
-        "suptitle": "\n".join([title or caption(result), *legend(result, near)]),
+        "suptitle": "\n".join(words),
         "hatched": None if near is None else near[:, *box],
         "limits": [each[:2] for each in colours],
         "cmap": colours[0].cmap,
+        "label": quantity(result),
+        "length_unit": result.length_unit,
+        "beside": {name: scalar[box] for name, scalar in anatomy(result).items()},
         "orientation": placed(volume, box, view),
         "z": None if result.z is None else result.z[:, *box],
         "path": path,
@@ -86,7 +96,54 @@ def signature_panels(
         return hks_panels(result.values[:, *box], result.times, grid, **style)
     if through is not None:
         style["node"] = [voxel - part.start for voxel, part in zip(through, box, strict=True)]
-    return volume_panels(result.values[:, *box], result.times, grid, length_unit=result.length_unit, **style)
+    return volume_panels(result.values[:, *box], result.times, grid, **style)
+
+
+def _on_mesh(
+    result: Result, near: Bool[np.ndarray, "n_times V"] | None, title: str, path: str | os.PathLike[str] | None
+) -> Figure:
+    mesh = result.place
+    assert isinstance(mesh, SurfaceMesh | TetMesh)
+    cells, words = mesh.triangulation, legend(result, near)
+    visible = cells.boundary_vertices if isinstance(mesh, TetMesh) else cells.used
+    if near is not None and near[:, visible].all():  # as on the boundary of a solid, where hatching would show nothing
+        near, words = None, [f"{RIM_NOTE} at all vertices"]
+    colours = free_colours(result.values, result.near_rim, visible, result.centre)
+    words = [title or caption(result), *words, *range_notes(result, result.values[:, visible], colours)]
+    style: dict[str, Any] = {"hatched": near, "label": quantity(result), "suptitle": "\n".join(words), "path": path}
+    return surface_panels(mesh, list(result.values), titles_of(result), colours, **style)
+
+
+def anatomy(result: Result) -> dict[str, Real[np.ndarray, "*shape"]]:
+    """Return the mean diffusivity (*shape,), NaN outside the domain, by its title; nothing if no diffusion is known."""
+    if result.diffusivity is None or result.tensors is None:
+        return {}
+    values = np.trace(result.tensors, axis1=-2, axis2=-1) / result.dimension
+    values = np.where(np.isfinite(result.values[0]), values, np.nan)
+    if result.unit != "s":
+        return {"mean diffusivity": values}
+    return {f"mean diffusivity\nin $10^{{-3}}$ {MM2_PER_S}": 1e3 * values}
+
+
+def quantity(result: Result) -> str:
+    """Return the name of a signature's values, for colour bars."""
+    factor, _ = POWERS[result.dimension]
+    root = r"\sqrt{|D|}\," if result.settings.get("operator") == "fick" else ""
+    names = {"heat-trace": "HKS / heat trace", "volume": "HKS · volume", "flat": f"${factor}{root}$·HKS"}
+    power = {2: "", 3: "$^{3/2}$"}[result.dimension]
+    return names.get(result.normalisation, f"HKS in 1/{result.unit}{power}" if result.unit == "s" else "HKS")
+
+
+def range_notes(result: Result, values: Real[np.ndarray, "n_times *shape"], colours: Sequence[Colours]) -> list[str]:
+    """Return lines of a legend: the share of values beyond the colours, and why colours do not diverge from 1."""
+    known = [each[np.isfinite(each)] for each in values]
+    beyond = [np.mean((v < low) | (v > high)) for v, (low, high, _) in zip(known, colours, strict=True)]
+    words = []
+    if (most := 100 * max(beyond)) >= 0.1:
+        words.append(f"arrows: up to {most:.2g} % of the values are beyond the colours")
+    if result.centre is not None and colours[0].cmap != DIVERGING:
+        words.append("colours do not diverge from 1, because nine tenths of the values are above 1.5")
+    return words
 
 
 def caption(result: Result) -> str:
@@ -119,6 +176,8 @@ def legend(result: Result, near: Bool[np.ndarray, "n_times *shape"] | None) -> l
 def titles_of(result: Result, unit: str | None = None) -> Sequence[str]:
     """Return a title for each time, with √(Dt) and the share of nodes above the noise if they are known.
 
+    On a surface with the metric of space, √t is a length in the mesh's unit, and takes the place of √(Dt).
+
     The text `unit` replaces the unit of t.
     """
     early = [" (too few eigenpairs)" * bool(t < result.smallest_time) for t in result.times]
@@ -127,25 +186,30 @@ def titles_of(result: Result, unit: str | None = None) -> Sequence[str]:
     if result.lengths is not None:
         lengths = (f"{length:.3g} {result.length_unit}".rstrip() for length in result.lengths)
         titles = [f"{title}\n$\\sqrt{{Dt}}$ = {length}" for title, length in zip(titles, lengths, strict=True)]
+    elif not isinstance(result.place, TensorVolume) and not result.settings.get("metric") and not result.in_time:
+        titles = [f"{title}\n$\\sqrt{{t}}$ = {t**0.5:.3g}" for title, t in zip(titles, result.times, strict=True)]
     if result.z is not None:
         shares = (np.mean(np.abs(z[np.isfinite(z)]) > FADED) for z in result.z)
         titles = [f"{title}\n{100 * share:.0f} % without grey" for title, share in zip(titles, shares, strict=True)]
     return titles
 
 
-def _colours(result: Result, inside: Bool[np.ndarray, "*shape"]) -> list[Colours]:
-    """Return the colours for each time, which span nearly all values away from the boundary."""
-    centre = 1.0 if result.normalisation == "flat" else None
-    chosen = nodes_for_colours(result, inside if result.near_rim is not None else away_from_rim(inside))
-    images = [values[nodes] for values, nodes in zip(result.values, chosen, strict=True)]
-    return colours_of(images, SPAN, LEAST_RANGE, centre)
+def free_colours(
+    values: Real[np.ndarray, "n_times *shape"],
+    near: Bool[np.ndarray, "n_times *shape"] | None,
+    nodes: Bool[np.ndarray, "*shape"],
+    centre: float | None,
+    shared: bool = False,
+) -> list[Colours]:
+    """Return the colours for each time, which span nearly all values at those of the nodes free of the boundary.
 
-
-def nodes_for_colours(result: Result, nodes: Bool[np.ndarray, "*shape"]) -> list[Bool[np.ndarray, "*shape"]]:
-    """Return those of the nodes at each time that are free of the boundary; all nodes if these are few or not known."""
-    near = result.near_rim
-    free = [nodes if near is None else nodes & ~near[i] for i in range(len(result.values))]
-    return [one if one.sum() > ENOUGH * nodes.sum() else nodes for one in free]
+    If less than a tenth of the nodes are free, all nodes count. If `shared`, one range spans the values of all times.
+    """
+    free = [nodes if near is None else nodes & ~near[i] for i in range(len(values))]
+    chosen = [one if one.sum() > ENOUGH * nodes.sum() else nodes for one in free]
+    images = [each[one] for each, one in zip(values, chosen, strict=True)]
+    rules = (SPAN, LEAST_RANGE, centre)
+    return colours_of([np.concatenate(images)], *rules) * len(images) if shared else colours_of(images, *rules)
 
 
 def middle_slice(

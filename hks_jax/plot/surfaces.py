@@ -1,9 +1,9 @@
 """Surfaces in space: meshes coloured by a scalar, and isosurfaces of a volume."""
 
 import math
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -23,12 +23,14 @@ from hks_jax.domain.components import active_elements, as_mask
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.simplicial_mesh import SurfaceMesh, TetMesh
 from hks_jax.optional import optional
-from hks_jax.plot.figure import finished, inches, new_figure
+from hks_jax.plot.figure import SMALL, arrows, finished, inches, lines_in, new_figure
 from hks_jax.plot.images import Colours, colours_of, masked
 from hks_jax.plot.volumes import require_volume
 
 STRIPES = 30
 """The largest number of dark stripes of hatched vertices along a side of a surface."""
+SIDES = ((30, -60), (-30, 120))
+"""The elevation and the azimuth, in degrees, of the two opposite directions from which figures show a surface."""
 LIGHT = (0.3, -0.5, 0.8)
 """The direction towards the light."""
 
@@ -122,19 +124,28 @@ def surface_panels(
     colours: Sequence[Colours],
     *,
     hatched: Bool[np.ndarray, "n V"] | None = None,
+    label: str = "",
     suptitle: str = "",
-    path: Path | None = None,
+    path: str | os.PathLike[str] | None = None,
 ) -> Figure:
-    """Return a figure with one surface, or boundary of a solid, for each array of values, with colours of its own."""
+    """Return a figure of a surface, or of the boundary of a solid, from two sides for each array of values.
+
+    Each array has colours of its own, and a colour bar with the label for both sides.
+    """
     columns = min(len(values), 4)
     rows = math.ceil(len(values) / columns)
-    figure = new_figure(3.4 * columns, 3.0 * rows + 0.3 + 0.3 * suptitle.count("\n"))
-    for i, (title, one, (low, high, cmap)) in enumerate(zip(titles, values, colours, strict=True)):
-        ax: Any = figure.add_subplot(rows, columns, i + 1, projection="3d")
+    figure = new_figure(3.1 * columns, 4.6 * rows + 0.2 + 0.18 * lines_in(suptitle))
+    blocks = np.atleast_1d(np.asarray(figure.subfigures(rows, columns, squeeze=False), dtype=object)).ravel()
+    for i, (block, title, one, (low, high, cmap)) in enumerate(zip(blocks, titles, values, colours, strict=False)):
+        sides: list[Any] = [block.add_subplot(2, 1, 1 + side, projection="3d") for side in range(2)]
         lines = None if hatched is None else hatched[i]
-        shown = surface(ax, mesh, one, vmin=low, vmax=high, cmap=cmap, hatched=lines)
-        figure.colorbar(shown, ax=ax, shrink=0.6)
-        ax.set_title(title, fontsize="medium")
+        for ax, direction in zip(sides, SIDES, strict=True):
+            ax.view_init(*direction)
+            shown = surface(ax, mesh, one, vmin=low, vmax=high, cmap=cmap, hatched=lines)
+        bar = block.colorbar(shown, ax=sides, shrink=0.6, extend=arrows(shown, shown.get_array()))
+        bar.ax.tick_params(labelsize=SMALL)
+        bar.set_label(label, fontsize=SMALL)
+        sides[0].set_title(title, fontsize="medium")
     return finished(figure, suptitle, path)
 
 

@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,10 +15,10 @@ from matplotlib.image import AxesImage
 from hks_jax.domain.components import as_mask
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_checks import require_grid
-from hks_jax.plot.figure import SMALL, colour_bar_in, finished, new_figure
+from hks_jax.plot.figure import SMALL, colour_bar_in, finished, lines_in, new_figure
 from hks_jax.plot.images import masked, panel_colours, scalar_image
 from hks_jax.plot.orientation import Orientation
-from hks_jax.plot.panels import checked_times, panel_titles
+from hks_jax.plot.panels import BESIDE, LINE, checked_times, panel_titles
 
 AXES = "xyz"
 PLANES = ((0, 1), (0, 2), (1, 2))
@@ -119,6 +119,7 @@ def volume_panels(
     unit: str = "",
     length_unit: str = "",
     limits: Sequence[tuple[float, float]] | None = None,
+    beside: Mapping[str, Real[ArrayLike, "nx ny nz"]] | None = None,
     path: str | os.PathLike[str] | None = None,
     label: str = "",
     suptitle: str = "",
@@ -138,6 +139,7 @@ def volume_panels(
         unit: the unit of t, which titles show after the value of t.
         length_unit: the unit of the coordinates.
         limits: the values of the first and the last colour for each time.
+        beside: other scalars (*shape,) by title, drawn in grey after the last time.
         path: the file in which to save the figure, if given.
         label: the colour bars' label.
         suptitle: the figure's title.
@@ -159,24 +161,29 @@ def volume_panels(
     t = checked_times(times, grid.shape, values=values, z=z, hatched=hatched)
     titles = panel_titles(t, titles, unit)
     volumes = [masked("values", each, grid) for each in np.ma.asarray(values)]
-    noise, lines = ([None] * t.size if each is None else np.asarray(each) for each in (z, hatched))
     colours = panel_colours(volumes, limits, **kwargs)
+    others = [masked(f"beside: {title}", each, grid) for title, each in (beside or {}).items()]
+    volumes, colours = [*volumes, *others], [*colours, *panel_colours(others, **BESIDE)]
+    titles, n = [*titles, *(beside or {})], len(volumes)
+    noise, lines = ([None] * n if each is None else [*np.asarray(each), *[None] * len(others)] for each in (z, hatched))
     _, shown, chosen = _turned(volumes[0], grid, node, orientation)
 
-    rows = math.ceil(t.size / _COLUMNS)
-    columns = math.ceil(t.size / rows)
+    rows = math.ceil(n / _COLUMNS)
+    columns = math.ceil(n / rows)
     sizes = np.multiply(shown.shape, shown.spacing)
     heights = [float(np.clip(_COLUMN * sizes[up] / max(sizes[:2]), _LEAST_HEIGHT, 3 * _COLUMN)) for _, up in PLANES]
     coordinates = [f"{name} ({length_unit})" if length_unit else name for name in AXES]
     fig = new_figure(
-        columns * (_COLUMN + 0.2) + 0.6, rows * (sum(heights) + 1.35 + 0.15 * bool(label)) + 0.3 * bool(suptitle)
+        columns * (_COLUMN + 0.2) + 0.6,
+        rows * (sum(heights) + 1.15 + 0.15 * bool(label) + LINE * max(map(lines_in, titles)))
+        + LINE * lines_in(suptitle),
     )
     blocks = np.atleast_1d(np.asarray(fig.subfigures(rows, 1), dtype=object))
     for row, block in enumerate(blocks):
         panels = block.subplots(4, columns, squeeze=False, height_ratios=[*heights, 0.09])
         for column in range(columns):
             index = row * columns + column
-            if index >= t.size:
+            if index >= n:
                 for ax in panels[:, column]:
                     ax.remove()
                 continue
@@ -194,7 +201,8 @@ def volume_panels(
                 ax.set_xlabel(coordinates[first], fontsize=SMALL, labelpad=1)
                 ax.set_ylabel(f"{place}\n{coordinates[second]}" if column == 0 else "", fontsize=SMALL)
                 ax.tick_params(labelleft=column == 0)
-            colour_bar_in(panels[3, column], image, label, values=volumes[index], orientation="horizontal")
+            quantity = label if index < t.size else ""
+            colour_bar_in(panels[3, column], image, quantity, values=volumes[index], orientation="horizontal")
     return finished(fig, suptitle, path)
 
 

@@ -1,5 +1,6 @@
 """Rotations of modes within multiple eigenvalues, which make the modes of two domains comparable."""
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -127,28 +128,26 @@ def _readings(pairs: Eigenpairs, given: Any) -> Float[np.ndarray, "m k"]:
     return np.asarray(maps, np.float64).reshape(-1, pairs.k)
 
 
-def _parts(pairs: Eigenpairs) -> Int[np.ndarray, " k"]:
-    return np.zeros(pairs.k, int) if pairs.part is None else np.asarray(pairs.part)
-
-
 def _groups(pairs: Eigenpairs, gap: float | None) -> Int[np.ndarray, " k"]:
     """Return the number of each mode's group.
 
-    All modes of a group belong to one part of a doubled domain. Either all of them are kept, or none is.
+    All modes of a group belong to one problem of a doubled domain. Either all of them are kept, or none is.
     """
-    values, part = np.asarray(pairs.eigenvalues, np.float64), 2 * _parts(pairs) + np.asarray(pairs.kept)
+    values = np.asarray(pairs.eigenvalues, np.float64)
+    kind = 2 * np.asarray(pairs.problem_numbers) + np.asarray(pairs.kept)
     labels = np.asarray(pairs.multiplets)
     if gap is not None:
         new = (np.diff(labels) > 0) & ~(np.diff(values) < gap * np.abs(values[1:]))
         labels = np.append(0, np.cumsum(new))[: pairs.k]
-    return np.unique(labels * (part.max(initial=0) + 1) + part, return_inverse=True)[1].reshape(-1)
+    return np.unique(labels * (kind.max(initial=0) + 1) + kind, return_inverse=True)[1].reshape(-1)
 
 
 def _partners(pairs: Eigenpairs, reference: Eigenpairs) -> Int[np.ndarray, " k"]:
-    """Return the reference's mode of the same number in the same part of a doubled domain; −1 without one."""
-    of_own, of_other, partners = _parts(pairs), _parts(reference), np.full(pairs.k, -1)
-    for part in np.unique(of_own):
-        mine, theirs = np.flatnonzero(of_own == part), np.flatnonzero(of_other == part)
+    """Return the reference's mode of the same number in the same problem of a doubled domain; −1 without one."""
+    of_own, of_other = np.asarray(pairs.problem_numbers), np.asarray(reference.problem_numbers)
+    partners = np.full(pairs.k, -1)
+    for number in np.unique(of_own):
+        mine, theirs = np.flatnonzero(of_own == number), np.flatnonzero(of_other == number)
         both = min(len(mine), len(theirs))
         partners[mine[:both]] = theirs[:both]
     return partners
@@ -157,12 +156,14 @@ def _partners(pairs: Eigenpairs, reference: Eigenpairs) -> Int[np.ndarray, " k"]
 # A unit vector v = Σ qⱼφⱼ has the residual ‖Kv − λMv‖ in the norm of M⁻¹, which is at most max |λⱼ − λ|.
 def _turned(pairs: Eigenpairs, rotation: Float[np.ndarray, "k k"], spread: Float[np.ndarray, " k"]) -> Eigenpairs:
     """Return the pairs with rotated vectors, and with the residuals that rotating unequal eigenvalues causes."""
-    dtype = pairs.eigenvalues.dtype
-    q = jnp.asarray(rotation, dtype)
-    mixed = jnp.asarray(spread > np.maximum(1e-6, 10 * np.asarray(pairs.residuals, np.float64)))
-    residuals = jnp.where(mixed, jnp.maximum(pairs.residuals, jnp.asarray(spread, dtype)), pairs.residuals)
-    return eqx.tree_at(
-        lambda p: (p.frame, p.residuals, p.converged),
-        pairs,
-        (matmul(q, pairs.frame), residuals, pairs.converged & ~mixed),
-    )
+    problems, numbers = [], np.asarray(pairs.problem_numbers)
+    for number, each in enumerate(pairs.problems):
+        places = np.flatnonzero(numbers == number)
+        q, apart = np.eye(each.k), np.zeros(each.k)  # pairs of a problem beyond the k of the doubled domain stay
+        q[: len(places), : len(places)], apart[: len(places)] = rotation[np.ix_(places, places)], spread[places]
+        mixed = jnp.asarray(apart > np.maximum(1e-6, 10 * np.asarray(each.residuals, np.float64)))
+        larger = jnp.maximum(each.residuals, jnp.asarray(apart, each.residuals.dtype))
+        residuals, converged = jnp.where(mixed, larger, each.residuals), each.converged & ~mixed
+        frame = matmul(jnp.asarray(q, each.frame.dtype), each.frame)
+        problems.append(replace(each, frame=frame, residuals=residuals, converged=converged))
+    return pairs.with_problems(problems)

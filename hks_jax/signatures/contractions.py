@@ -123,43 +123,29 @@ class SquaredDistances(_FromSources):
 
 def by_numpy(
     fixed: bool,
-    copies: int,
     contraction: Contraction,
     filters: Filter,
     values: Float[Array, " k"],
     vectors: Float[Array, "k n_dof"],
     kept: Bool[Array, " k"],
-    selection: tuple[Array, Array] | None,
-    space: FunctionSpace,
     reader: Any,
 ) -> HostMap | None:
     """Return the derivative of a kernel's diagonal by NumPy; None for other kernels, and for large ones."""
-    k = len(values) if selection is None else len(selection[0])
-    m = len(jax.tree.leaves(filters)[0])
-    plain = isinstance(contraction, Diagonal) and reader is None and k > 0
+    k, m = len(values), len(jax.tree.leaves(filters)[0])
+    plain = isinstance(contraction, Diagonal) and reader is None
     if not plain or vectors.size > _ON_HOST or m * k * k > _ON_HOST:
         return None
-    rows: Any = slice(None)
-    own_values, functions, included = map(np.asarray, (values, vectors, kept))
-    if selection is not None:
-        rows, own = map(np.asarray, selection)
-        own_values, included, functions = own_values[rows], included[rows], np.where(own[:, None], functions[rows], 0)
-    weights, of_f, of_lambda_f, matters = map(
-        np.asarray, mixing(filters, jax.device_put(own_values), jax.device_put(included), fixed)
-    )
+    functions, included = np.asarray(vectors), np.asarray(kept)
+    weights, of_f, of_lambda_f, matters = map(np.asarray, mixing(filters, values, kept, fixed))
     # For each filter, the matrix entry (i, j) is negligible unless i < n or j < n. The matrices are symmetric, so a sum
     # over i < n and all j is enough, if its terms with j ≥ n count twice.
     last = [int(np.max(np.flatnonzero(one), initial=-1)) + 1 for one in matters]
     times = [np.where(np.arange(k) < n, 1, 2) for n in last]
 
-    def transferred(rows: np.ndarray, of: FunctionSpace, to: FunctionSpace) -> np.ndarray:
-        return np.asarray(of.transfer(jax.device_put(rows), to))
-
     def apply(changes: tuple[Array, Pencil]) -> np.ndarray:
-        d_frame, change = np.where(included[:, None], np.asarray(changes[0])[rows], 0), changes[1]
-        moved = transferred(functions, space, change.space)
-        images = ((matrix.to_scipy() @ moved.T).T for matrix in (change.stiffness, change.mass))
-        stiffness, mass = (copies * transferred(each, change.space, space) @ functions.T for each in images)
+        d_frame, change = np.where(included[:, None], np.asarray(changes[0]), 0), changes[1]
+        images = ((matrix.to_scipy() @ functions.T).T for matrix in (change.stiffness, change.mass))
+        stiffness, mass = (each @ functions.T for each in images)
         result = weights @ (2 * functions * d_frame)
         for one, (n, count) in enumerate(zip(last, times, strict=True)):
             matrix = (of_f[one] * stiffness - of_lambda_f[one] * mass)[:n] * count
@@ -172,9 +158,7 @@ def by_numpy(
             outer = (functions[:n] * y[one]) @ functions.T * count
             stiffness[:n] += of_f[one, :n] * outer
             mass[:n] -= of_lambda_f[one, :n] * outer
-        d_frame, change = np.zeros(like[0].shape, like[0].dtype), like[1]
-        d_frame[rows] = np.where(included[:, None], 2 * functions * (weights.T @ y), 0)
-        images = (transferred(copies * each @ functions, space, change.space) for each in (stiffness, mass))
-        return d_frame, change_of(change, transferred(functions, space, change.space), *images)
+        d_frame = np.where(included[:, None], 2 * functions * (weights.T @ y), 0)
+        return d_frame, change_of(like[1], functions, stiffness @ functions, mass @ functions)
 
     return HostMap(apply, transpose)

@@ -63,13 +63,11 @@ def _warn_if_truncated(pairs: Eigenpairs, times: Float[Array, " n_times"], rows:
     pairs, times, rows = jax.lax.stop_gradient((pairs, times, rows))
     if is_traced((pairs.eigenvalues, pairs.pencil, times, rows)):
         return
-    mass, u = pairs.pencil.parts[0].mass, pairs.space.restrict(rows)
-    image = mass.apply(u)
-    n_parts = len(pairs.pencil.parts)
-    coefficients = n_parts * jnp.matmul(image, pairs.vectors.T, precision="highest")
-    used = pairs.of_part(0).kept
-    squared = n_parts * jnp.sum(u * image, axis=1)
-    beyond = jnp.maximum(squared - jnp.sum(jnp.where(used, coefficients**2, 0), axis=1), 0)
+    even, u = pairs.problems[0], pairs.space.restrict(rows)
+    image = even.pencil.mass.apply(u)
+    coefficients = jnp.matmul(image, even.vectors.T, precision="highest")
+    squared = jnp.sum(u * image, axis=1)
+    beyond = jnp.maximum(squared - jnp.sum(jnp.where(even.kept, coefficients**2, 0), axis=1), 0)
     share = float(jnp.max(jnp.where(squared > 0, beyond / jnp.where(squared > 0, squared, 1), 0))) ** 0.5
     rate = float(pairs.next_eigenvalue - pairs.spectral_origin)
     left = share * float(np.exp(-float(jnp.min(times)) * rate))

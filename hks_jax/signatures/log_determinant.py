@@ -82,7 +82,7 @@ def heat_coefficients(
     require_number("euler_characteristic", euler_characteristic, above=-math.inf)
     require_number("boundary_length", boundary_length, inclusive=True)
     area = volume_of(pairs, "the heat trace")
-    if pairs.pencil.parts[0].weighted_volume is not None:
+    if pairs.problems[0].pencil.weighted_volume is not None:
         raise ValueError(
             "pairs: got an operator whose volume element is not that of its metric (Fick's, or with a density); "
             "expected a Laplace–Beltrami operator, whose a₂ is known. Pass your own coefficients to `log_determinant`"

@@ -96,7 +96,7 @@ def decompose(pairs: Eigenpairs, f: Any) -> Float[Array, "*functions k"]:
         [0.5]
     """
     fit = _fitted(pairs, f)
-    return fit.coefficients.reshape(*fit.leading, pairs.k)
+    return _of_doubled(pairs, fit.coefficients).reshape(*fit.leading, pairs.k)
 
 
 @nan_is_meant
@@ -157,16 +157,16 @@ def energy(pairs: Eigenpairs, f: Any, diffusivity: Any = None) -> ModeEnergies:
         True
     """
     fit = _fitted(pairs, f)
-    copies, k, dtype = len(pairs.pencil.parts), pairs.k, fit.coefficients.dtype
+    c, k, dtype = fit.coefficients, pairs.k, fit.coefficients.dtype
     known = np.ones(fit.rows.shape[1:], dtype) if fit.measured is None else fit.measured.astype(dtype)
-    gram = np.eye(k, dtype=dtype) if fit.gram is None else fit.gram
-    found = _energies(_measure(pairs), fit.rows, known, fit.coefficients, fit.modes, gram, copies)
-    energies, residual, share, total = found
+    gram = np.eye(c.shape[1], dtype=dtype) if fit.gram is None else fit.gram
+    terms = pairs.of_even(_terms(c, gram))
+    residual, share, total = _residuals(_measure(pairs), fit.rows, known, c, fit.modes, terms)
     return ModeEnergies(
-        fit.coefficients.reshape(*fit.leading, k),
+        _of_doubled(pairs, c).reshape(*fit.leading, k),
         pairs.eigenvalues,
         *lengths_of(pairs, diffusivity),
-        energies.reshape(*fit.leading, k),
+        pairs.of_even(c * c).reshape(*fit.leading, k),
         residual.reshape(*fit.leading, k),
         share.reshape(*fit.leading, k),
         total.reshape(fit.leading),
@@ -175,11 +175,14 @@ def energy(pairs: Eigenpairs, f: Any, diffusivity: Any = None) -> ModeEnergies:
 
 # The residual f − Σcⱼφⱼ of the fit is orthogonal to all modes. So the residual of the first i modes is the sum of the
 # squared norms of the fit's residual and of Σ_{j>i} cⱼφⱼ, which is a sum over j > i of the ``terms``.
-@numpy_where_known(static_argnums=6)
-def _energies(
-    xp: Any, measure: Any, rows: Any, known: Any, c: Any, modes: Any, gram: Any, copies: int
-) -> tuple[Any, Any, Any, Any]:
-    """Return the energies, the residuals and the shares of variance (s, k), and ∫f² (s)."""
+@numpy_where_known()
+def _terms(xp: Any, c: Any, gram: Any) -> Any:
+    return c * (2 * matmul(c, xp.tril(gram, -1)) + xp.diagonal(gram)[None] * c)
+
+
+@numpy_where_known()
+def _residuals(xp: Any, measure: Any, rows: Any, known: Any, c: Any, modes: Any, terms: Any) -> tuple[Any, Any, Any]:
+    """Return the residuals and the shares of variance (s, k), and ∫f² (s)."""
 
     def integral(u: Any) -> Any:
         return xp.sum(u * _weighted(xp, measure, u), axis=1)
@@ -187,20 +190,19 @@ def _energies(
     total, one = integral(rows), known[None]
     mean = xp.sum(_weighted(xp, measure, rows) * one, axis=1) / integral(one)
     variance = integral(rows - mean[:, None] * one)
-    terms = c * (2 * matmul(c, xp.tril(gram, -1)) + xp.diagonal(gram)[None] * c)
     beyond = xp.cumsum(terms[:, ::-1], axis=1)[:, ::-1] - terms
     left = integral((rows - matmul(c, modes)) * one)
-    residual = xp.maximum(left[:, None] + beyond / copies, 0)
+    residual = xp.maximum(left[:, None] + beyond, 0)
     varies = variance > xp.finfo(c.dtype).eps * total
     share = xp.where(varies[:, None], 1 - residual / xp.where(varies, variance, 1)[:, None], xp.nan)
-    return c * c / copies, residual, share, total
+    return residual, share, total
 
 
 def lengths_of(pairs: Eigenpairs, diffusivity: Any = None) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
     """Return the wavelengths and the widths (FWHM) for which modes stand, as `energy` documents them."""
     dtype = pairs.eigenvalues.dtype
     if diffusivity is None:
-        diffusivity = mean_diffusivity(pairs.pencil.parts[0].metric, pairs.space, dtype)
+        diffusivity = mean_diffusivity(pairs.problems[0].pencil.metric, pairs.space, dtype)
     else:
         require_number("diffusivity", diffusivity)
     return _lengths(pairs.eigenvalues, jnp.asarray(diffusivity, dtype))
@@ -280,12 +282,12 @@ def spectral_filter(
 
 
 class _Fit(NamedTuple):
-    """The least-squares fit of the modes to maps at the free nodes."""
+    """The least-squares fit of the modes of the even problem to maps at the free nodes."""
 
     rows: Float[Array, "s n"]  # the maps, 0 at unmeasured nodes
     leading: tuple[int, ...]  # the axes of the maps
     measured: Bool[Array, " n"] | None  # None if all nodes are known to be measured
-    modes: Float[Array, "k n"]  # the modes at the nodes; 0 for odd modes and those not kept
+    modes: Float[Array, "k n"]  # the modes at the nodes; 0 for those not kept
     coefficients: Float[Array, "s k"]
     gram: Float[Array, "k k"] | None  # the inner products of the modes over the measured nodes; None for the identity
 
@@ -325,18 +327,17 @@ def _given(
 def _fitted(pairs: Eigenpairs, f: Any) -> _Fit:
     """Return the fit of `decompose`, after its checks of the maps f."""
     rows, leading, measured = _given(pairs, f)
-    copies, even = len(pairs.pencil.parts), pairs.of_part(0).kept
-    measure = _measure(pairs)
-    modes = _chosen(pairs.at_nodes, even)
+    even, measure = pairs.problems[0], _measure(pairs)
+    modes = _chosen(even.at_nodes, even.kept)
     if measured is None and measure[1] is None:
-        return _Fit(rows, leading, None, modes, _products(measure, modes, rows, None, copies), None)
-    gram = partial(_gram, measure, even=even, copies=copies)
+        return _Fit(rows, leading, None, modes, _products(measure, modes, rows, None), None)
+    gram = partial(_gram, measure, kept=even.kept)
     if measured is not None and is_traced(measured) and measure[1] is None:
-        identity = jnp.eye(pairs.k, dtype=modes.dtype)
+        identity = jnp.eye(even.k, dtype=modes.dtype)
         inner = jax.lax.cond(jnp.all(jnp.asarray(measured)), lambda *_: identity, gram, modes, measured)
     else:
         inner = gram(modes, measured)
-    coefficients, least = _solved(inner, _products(measure, modes, rows, measured, copies))
+    coefficients, least = _solved(inner, _products(measure, modes, rows, measured))
     _tell_if_unsure(pairs.k, least, measured)
     mask = None if measured is None else jnp.asarray(measured)
     return _Fit(rows, leading, mask, modes, coefficients, inner)
@@ -344,8 +345,15 @@ def _fitted(pairs: Eigenpairs, f: Any) -> _Fit:
 
 def _measure(pairs: Eigenpairs) -> tuple[Operator, Float[Array, " n"] | None]:
     """Return the mass of the domain, and for cancelling elements its row sums, which integrate nodal values."""
-    part = pairs.pencil.parts[0]
-    return part.mass, part.row_sums
+    pencil = pairs.problems[0].pencil
+    return pencil.mass, pencil.row_sums
+
+
+# On a domain doubled m times, an even mode has norm 1; on the domain itself, it is 1/√2ᵐ times the mode of the even
+# problem, and its integral with a map over the doubled domain is 2ᵐ times that over the domain itself.
+def _of_doubled(pairs: Eigenpairs, coefficients: Float[Array, "s k0"]) -> Float[Array, "s k"]:
+    """Return the coefficients in all modes, given those in the modes of the even problem."""
+    return pairs.of_even(coefficients if len(pairs.problems) == 1 else math.sqrt(len(pairs.problems)) * coefficients)
 
 
 def _weighted(xp: Any, measure: Any, rows: Any) -> Any:
@@ -355,24 +363,23 @@ def _weighted(xp: Any, measure: Any, rows: Any) -> Any:
 
 
 @numpy_where_known()
-def _chosen(xp: Any, modes: Any, even: Any) -> Any:
-    return xp.where(even[:, None], modes, 0)
+def _chosen(xp: Any, modes: Any, kept: Any) -> Any:
+    return xp.where(kept[:, None], modes, 0)
 
 
-# Each doubling of the domain doubles inner products of even functions. Even functions are orthogonal to odd ones.
-@numpy_where_known(static_argnums=4)
-def _products(xp: Any, measure: Any, modes: Any, rows: Any, measured: Any, copies: int) -> Any:
+@numpy_where_known()
+def _products(xp: Any, measure: Any, modes: Any, rows: Any, measured: Any) -> Any:
     """Return the inner products (s, k) of rows, which are 0 at unmeasured nodes, with the modes at measured nodes."""
-    weights = copies * _weighted(xp, measure, rows)
+    weights = _weighted(xp, measure, rows)
     if measured is not None:
         weights = xp.where(measured[None], weights, 0)
     return inner_products(modes, weights) if xp is jnp else weights @ modes.T
 
 
-def _gram(measure: Any, modes: Any, measured: Any, even: Any, copies: int) -> Float[Array, "k k"]:
+def _gram(measure: Any, modes: Any, measured: Any, kept: Any) -> Float[Array, "k k"]:
     """Return the inner products of the modes over the measured nodes, and 1 on the diagonal for unused modes."""
     own = modes if measured is None else jnp.where(measured[None], modes, 0)
-    return _products(measure, own, own, measured, copies) + jnp.diag(1 - even.astype(modes.dtype))
+    return _products(measure, own, own, measured) + jnp.diag(1 - kept.astype(modes.dtype))
 
 
 @numpy_where_known()

@@ -89,7 +89,7 @@ def boundary_influence(
 
 def is_estimated(pairs: Eigenpairs) -> bool:
     """Return whether `boundary_influence` is estimated, because the eigenpairs belong to one problem at some sides."""
-    first, last = pairs.pencil.parts[0].space, pairs.pencil.parts[-1].space
+    first, last = pairs.problems[0].space, pairs.problems[-1].space
     return bool((rim_of(pairs.pencil) & ~(first.free & ~last.free)).any())
 
 
@@ -98,13 +98,13 @@ def influence_of(pairs: Eigenpairs, times: Float[Array, " m"]) -> Float[Array, "
     if not is_known(pairs.pencil):
         raise ValueError("domain: got eigenpairs of other matrices; expected eigenpairs of a field or a mesh")
     if rim_of(pairs.pencil).any() and not is_estimated(pairs):
-        return _share(*(spectral_diagonal(pairs.of_part(i), Heat(times)) for i in (0, len(pairs.pencil.parts) - 1)))
+        return _share(*(spectral_diagonal(pairs.problems[i], Heat(times)) for i in (0, -1)))
     return estimate_of(pairs, times)
 
 
 def estimate_of(pairs: Eigenpairs, times: Float[Array, " m"]) -> Float[Array, "m *shape"]:
     """Return the estimate of `boundary_influence` from first passage times, which needs no eigenpairs."""
-    return _estimate(pairs.pencil.parts[0], rim_of(pairs.pencil), jax.lax.stop_gradient(times))
+    return _estimate(pairs.problems[0].pencil, rim_of(pairs.pencil), jax.lax.stop_gradient(times))
 
 
 def _share(neumann: Float[Array, "m *shape"], dirichlet: Float[Array, "m *shape"]) -> Float[Array, "m *shape"]:

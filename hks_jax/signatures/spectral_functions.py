@@ -1,6 +1,7 @@
 """Spectral functions Φ f(Λ) Φᵀ, which all signatures use, and their derivative rule."""
 
 import operator
+from collections.abc import Callable
 from functools import partial, reduce
 
 import jax
@@ -11,20 +12,17 @@ from jaxtyping import Array, Bool, Float, Int
 from hks_jax.arrays import StaticArray, nan_outside
 from hks_jax.checks import require_static
 from hks_jax.compilation import jit_quickly
-from hks_jax.eigen.eigenpairs import Eigenpairs
+from hks_jax.eigen.eigenpairs import Eigenpairs, PencilEigenpairs
 from hks_jax.eigen.rotations import changes_between
 from hks_jax.fem.nodal import on_all_nodes
-from hks_jax.fem.pencil import MirrorPencil, Pencil
+from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.linear_map import first_order_only, instantiated, is_constant
 from hks_jax.linear.linear_program import linear_program
 from hks_jax.linear.products import row_blocks
 from hks_jax.signatures.contractions import Applied, Columns, Contraction, Diagonal, SquaredDistances, by_numpy
 from hks_jax.signatures.filters import Custom, Derivative, Filter, mixing, weights_of
-from hks_jax.traced import is_traced
 
-_SIZES = 8
-"""The number of sizes for the eigenpairs of an even or odd problem of a doubled domain; each size is compiled."""
 _FILTERS = 8
 """The number of filters whose matrices (k, k) are computed and applied to the eigenvectors at once."""
 
@@ -33,27 +31,23 @@ def spectral_diagonal(
     pairs: Eigenpairs, filters: Filter, scale: Float[Array, " m"] | None = None
 ) -> Float[Array, "m *shape"]:
     """Return Σᵢ f(λᵢ) φᵢ(x)² for each of m filters f, times the filter's entry of ``scale``; NaN outside the mask."""
-    everywhere = pairs.on(on_all_nodes(pairs.pencil))
-    diagonal = _kernel(Diagonal(), filters, everywhere)
+    diagonal = _mean(pairs, filters, lambda space: Diagonal())
     # NaN is inserted after the multiplication, because 0·NaN would make the derivative with respect to ``scale`` NaN.
-    nodal = everywhere.space.extend(diagonal if scale is None else scale[:, None] * diagonal)
-    return nan_outside(nodal, pairs.space.domain)
+    scaled = diagonal if scale is None else scale.reshape(-1, *[1] * len(pairs.space.node_shape)) * diagonal
+    return nan_outside(scaled, pairs.space.domain)
 
 
 def spectral_columns(pairs: Eigenpairs, filters: Filter, sources: Int[np.ndarray, " s"]) -> Float[Array, "m s *shape"]:
     """Return Σᵢ f(λᵢ) φᵢ(x_s) φᵢ(x) for each filter and each source node (flat node index); NaN outside the mask."""
-    everywhere = pairs.on(on_all_nodes(pairs.pencil))
-    columns = _kernel(Columns(everywhere.space, StaticArray(sources)), filters, everywhere)
-    return nan_outside(everywhere.space.extend(columns), pairs.space.domain)
+    columns = _mean(pairs, filters, lambda space: Columns(space, StaticArray(sources)))
+    return nan_outside(columns, pairs.space.domain)
 
 
 def spectral_squared_distances(
     pairs: Eigenpairs, filters: Filter, sources: Int[np.ndarray, " s"]
 ) -> Float[Array, "m s *shape"]:
     """Return Σᵢ f(λᵢ) (φᵢ(x_s) − φᵢ(x))² for each filter and each source node; meaningless outside the mask."""
-    everywhere = pairs.on(on_all_nodes(pairs.pencil))
-    squared = _kernel(SquaredDistances(everywhere.space, StaticArray(sources)), filters, everywhere)
-    return squared.reshape(*squared.shape[:-1], *pairs.space.node_shape)
+    return _mean(pairs, filters, lambda space: SquaredDistances(space, StaticArray(sources)))
 
 
 def spectral_flow(
@@ -61,14 +55,13 @@ def spectral_flow(
 ) -> Float[Array, "m s *shape"]:
     """Return Σᵢ f(λᵢ) φᵢ(x) ∫φᵢu for each of m filters and s functions u; NaN outside the mask.
 
-    Under "mirror" and "mean" functions are reflected to the doubled domain, as the metric is.
+    Under "mirror" and "mean" functions are reflected to the doubled domain, as the metric is. So they are even, and
+    only the even problem matters.
     """
-    # Each doubling of the domain doubles inner products of even functions. Even functions are orthogonal to odd ones.
-    everywhere = pairs.on(on_all_nodes(pairs.pencil))
-    parts, known = everywhere.pencil.parts, pairs.space.restrict(functions)
-    functionals = len(parts) * parts[0].integrals(pairs.space.transfer(known, everywhere.space))
-    flow = _kernel(Applied(functionals), filters, everywhere.of_part(0))
-    return nan_outside(everywhere.space.extend(flow), pairs.space.domain)
+    even = _on_all_nodes(pairs.problems[0])
+    known = pairs.space.transfer(pairs.space.restrict(functions), even.space)
+    flow = _kernel(Applied(even.pencil.integrals(known)), filters, even)
+    return nan_outside(even.space.extend(flow), pairs.space.domain)
 
 
 def spectral_trace(pairs: Eigenpairs, filters: Filter) -> Float[Array, " m"]:
@@ -76,16 +69,32 @@ def spectral_trace(pairs: Eigenpairs, filters: Filter) -> Float[Array, " m"]:
     return jnp.sum(_all_weights(filters, pairs.eigenvalues, pairs.kept), axis=1)
 
 
+# Functions on a doubled domain are sums of functions of its even and odd problems. A point source is the mean of an
+# even function and odd ones, so the kernel between points of the original domain is the mean of the problems' kernels.
+def _mean(pairs: Eigenpairs, filters: Filter, contraction: Callable[[FunctionSpace], Contraction]) -> Array:
+    """Return the mean over all problems of the contractions (…, *shape) of kernels; meaningless outside the mask."""
+    problems = [_on_all_nodes(each) for each in pairs.problems]
+    nodal = [_nodal(each.space, _kernel(contraction(each.space), filters, each)) for each in problems]
+    return nodal[0] if len(nodal) == 1 else reduce(operator.add, nodal) / len(nodal)
+
+
+def _on_all_nodes(pairs: PencilEigenpairs) -> PencilEigenpairs:
+    return pairs.on(on_all_nodes(pairs.pencil))
+
+
+def _nodal(space: FunctionSpace, values: Float[Array, "*leading n"]) -> Float[Array, "*leading_and_shape"]:
+    """Return the nodal values of a contraction, which are given at the free nodes or at all nodes."""
+    if values.shape[-1] == space.n_dof:
+        return space.extend(values, outside=0.0)
+    return values.reshape(*values.shape[:-1], *space.node_shape)
+
+
 @jax.custom_jvp
-def _kernel(contraction: Contraction, filters: Filter, pairs: Eigenpairs) -> Array:
+def _kernel(contraction: Contraction, filters: Filter, pairs: PencilEigenpairs) -> Array:
     """Return the contraction of the kernels Φ f(Λ) Φᵀ of m filters."""
     # Second derivatives, for which JAX would differentiate this function and not its rule, are not supported.
     pairs = first_order_only(pairs)
-    return _weighted(contraction, _all_weights(filters, pairs.eigenvalues, pairs.kept), _read(pairs, pairs.frame))
-
-
-def _read(pairs: Eigenpairs, vectors: Float[Array, "k n_dof"]) -> Float[Array, "k n_dof"]:
-    return pairs.pencil.read(vectors, pairs.part)
+    return _weighted(contraction, _all_weights(filters, pairs.eigenvalues, pairs.kept), pairs.pencil.read(pairs.frame))
 
 
 @jit_quickly()
@@ -106,8 +115,7 @@ def _weighted(contraction: Contraction, weights: Float[Array, "m k"], vectors: F
 #     Σᵢ f(λᵢ) (φᵢxᵢᵀ + xᵢφᵢᵀ),    xᵢ = (I − ΦΦᵀM) dφᵢ,
 #
 # where Φ has only the kept eigenvectors, and xᵢ is the part of dφᵢ outside their span, the derivative of the frame
-# (hks_jax/eigen/derivative.py). Under "mirror" and "mean" the differential is the sum of the differentials of the even
-# and odd problems, whose eigenvectors do not mix.
+# (hks_jax/eigen/derivative.py).
 #
 # Signatures use the kernel RΦ f(Λ) ΦᵀRᵀ, where the matrix R maps coefficients to values at the nodes (`Pencil.read`).
 # In the differential of this kernel, R multiplies each φᵢ and xᵢ from the left, and the derivative dR adds the terms
@@ -122,19 +130,15 @@ def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
         terms.append(_kernel(contraction, Derivative(filters, instantiated(d_filters)), pairs))
     if not is_constant(d_pairs.pencil):
         pairs = first_order_only(pairs)
-        change, d_frame = instantiated((d_pairs.pencil, d_pairs.frame))
-        for number, part in enumerate(pairs.pencil.parts):
-            own = pairs.of_part(number)
-            reader = None if part.row_sums is None else part
-            rows = _rows_of(own, number)
-            known = contraction, filters, own.eigenvalues, own.frame, own.kept, rows, pairs.space, reader
-            settings, moved = (part.n_fixed > 0, len(pairs.pencil.parts)), (d_frame, change.parts[number])
-            terms.append(linear_program(_tangent, settings, known, moved, value, by_numpy))
+        pencil, moved = pairs.pencil, instantiated((d_pairs.frame, d_pairs.pencil))
+        reader = None if pencil.row_sums is None else pencil
+        known = contraction, filters, pairs.eigenvalues, pairs.frame, pairs.kept, reader
+        terms.append(linear_program(_tangent, (pencil.n_fixed > 0,), known, moved, value, by_numpy))
     elif not is_constant((d_pairs.eigenvalues, d_pairs.frame)):  # the arrays themselves change, so JAX's rules apply
         pairs = first_order_only(pairs)
         moved = jax.jvp(
             lambda values, vectors: _weighted(
-                contraction, _all_weights(filters, values, pairs.kept), _read(pairs, vectors)
+                contraction, _all_weights(filters, values, pairs.kept), pairs.pencil.read(vectors)
             ),
             (pairs.eigenvalues, pairs.frame),
             instantiated((d_pairs.eigenvalues, d_pairs.frame)),
@@ -143,60 +147,29 @@ def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     return value, reduce(operator.add, terms) if terms else jnp.zeros_like(value)
 
 
-def _rows_of(pairs: Eigenpairs, number: int) -> tuple[Int[Array, " m"], Bool[Array, " m"]] | None:
-    """Return numbers of rows that include the pairs of one part, and whether each row belongs to this part.
-
-    Parts are the even and odd problems of a doubled domain; the result is None if no domain is doubled. The number of
-    rows is rounded up to one of `_SIZES` sizes.
-    """
-    if pairs.part is None:
-        return None
-    assert isinstance(pairs.pencil, MirrorPencil)
-    own = jax.lax.stop_gradient(pairs.part) == number
-    most = pairs.k // len(pairs.pencil.including[number])
-    if not is_traced(own):
-        step = -(-pairs.k // _SIZES)
-        most = min(most, step * -(-int(own.sum()) // step))
-    rows = jnp.argsort(~own)[:most]
-    return rows, own[rows]
-
-
 # The transposed derivative recomputes intermediate results, which would take twice the memory of the eigenvectors.
-@partial(jax.checkpoint, static_argnums=(0, 1))
+@partial(jax.checkpoint, static_argnums=0)
 def _tangent(
     fixed: bool,
-    copies: int,
     contraction: Contraction,
     filters: Filter,
     values: Float[Array, " k"],
     vectors: Float[Array, "k n_dof"],
     kept: Bool[Array, " k"],
-    selection: tuple[Int[Array, " m"], Bool[Array, " m"]] | None,
-    space: FunctionSpace,
     reader: Pencil | None,
     changes: tuple[Float[Array, "k n_dof"], Pencil],
 ) -> Array:
-    """Return the derivative of the contraction for the change of one pencil, given its pairs.
+    """Return the derivative of the contraction for the change of the pencil, given its pairs.
 
     ``changes`` are the xᵢ of the pairs (d_frame), and the change of the pencil.
     """
     d_frame, change = changes
-    if selection is not None:
-        values, vectors, kept, d_frame = (x[selection[0]] for x in (values, vectors, kept, d_frame))
-    if selection is not None:
-        vectors = jnp.where(selection[1][:, None], vectors, 0)  # eigenvectors of different problems do not mix
-    if not len(vectors):
-        return jnp.zeros_like(contraction.weighted(_all_weights(filters, values, kept), vectors))
     d_frame = jnp.where(kept[:, None], d_frame, 0)  # d_frame may be NaN where pairs are not kept
-    stiffness, mass = changes_between(vectors, space, copies, change)
+    stiffness, mass = changes_between(vectors, change)
     weights = _all_weights(filters, values, kept)
     read, d_read = vectors, d_frame
     if reader is not None:
-
-        def read_by(pencil: Pencil, x: Array) -> Array:
-            return pencil.space.transfer(pencil.read(space.transfer(x, pencil.space)), space)
-
-        read, d_read = jax.jvp(read_by, (reader, vectors), (change, d_frame))
+        read, d_read = jax.jvp(Pencil.read, (reader, vectors), (change, d_frame))
     _, outer = jax.jvp(lambda x: contraction.weighted(weights, x), (read,), (d_read,))
 
     def inner(some: Filter) -> Array:

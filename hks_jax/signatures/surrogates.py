@@ -63,7 +63,8 @@ def surrogates(
     found = energy(pairs, f)
     _tell_if_lacking(pairs.k, jax.lax.stop_gradient(found.explained))
     labels = pairs.multiplets if groups is None else _checked_groups(groups, pairs.k)
-    turns = pairs.of_part(0).kept & (pairs.eigenvalues != 0)
+    even = pairs.problems[0]
+    turns = pairs.of_even(even.kept & (even.eigenvalues != 0))
     rotations = _random_rotations(key, n, jnp.asarray(labels), turns, pairs.eigenvalues.dtype)
     turned = jnp.einsum("nij,...j->n...i", rotations, found.coefficients, precision="highest")
     return reconstruct(pairs, turned)

@@ -20,7 +20,7 @@ from hks_jax.traced import is_traced
 
 def times_of(pairs: Eigenpairs, times: Any) -> Float[Array, " n"]:
     """Return times as an array with the dtype of the pairs; raise TypeError or ValueError if they are invalid."""
-    return checked_times(times, require_pairs(pairs).eigenvalues.dtype)
+    return checked_times(times, require_pairs(pairs).problems[0].eigenvalues.dtype)
 
 
 def dimension_of(pairs: Eigenpairs, purpose: str) -> int:

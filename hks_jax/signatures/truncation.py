@@ -363,8 +363,10 @@ def truncation_map(
 @jax.jit
 def _map(pairs: Eigenpairs, at: Float[Array, " n"]) -> Float[Array, "n *shape"]:
     dtype, bottom = at.dtype, pairs.spectral_origin
-    moved = pairs.eigenvalues - bottom, pairs.next_eigenvalue - bottom
-    pairs = eqx.tree_at(lambda p: (p.eigenvalues, p.next_eigenvalue), pairs, moved)
+    pairs = pairs.with_problems(
+        dataclasses.replace(each, eigenvalues=each.eigenvalues - bottom, next_eigenvalue=each.next_eigenvalue - bottom)
+        for each in pairs.problems
+    )
     complete, axes = jnp.isinf(pairs.next_eigenvalue), (1,) * len(pairs.space.node_shape)
     # Λ lies midway between the last and the next eigenvalue, because there may be few or multiple eigenvalues.
     last = jnp.max(jnp.where(pairs.kept, pairs.eigenvalues, 0))

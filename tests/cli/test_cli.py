@@ -288,10 +288,11 @@ def test_a_volume_is_computed_whole(nifti, tmp_path, monkeypatch):
         assert image.shape == (*SHAPE, 5, 2)
         np.testing.assert_allclose(image.affine, nib.load(nifti).affine)
         np.testing.assert_array_equal(image.get_fdata(), np.moveaxis(read["hks"], 0, -1))
-    # Two columns of three slices with a colour bar each; the lines cross at voxel (8, 5, 3), in coordinates of space.
+    # Two times and the mean diffusivity: columns of three slices with a colour bar each. The lines cross at voxel
+    # (8, 5, 3), in coordinates of space.
     place = nib.load(nifti).affine @ [8, 5, 3, 1]
     panels = drawn[0].axes
-    assert len(panels) == 8
+    assert len(panels) == 12
     assert [line.get_xdata()[0] for line in panels[0].lines][:1] == [place[0]]
     assert drawn[0].get_suptitle().startswith("$(4\\pi t)^{3/2}$·HKS, which is 1 for flat space, metric D⁻¹\nD = ")
     assert "\n$\\sqrt{Dt}$ = " in panels[0].get_title()
@@ -569,7 +570,8 @@ def test_a_failed_computation_is_code_1(npz, tmp_path, capsys, monkeypatch):
 
     def unconverged(*args, **kwargs):
         pairs = compute(*args, **kwargs)
-        return eqx.tree_at(lambda p: p.converged, pairs, np.zeros(pairs.k, bool))
+        none = (eqx.tree_at(lambda p: p.converged, each, np.zeros(each.k, bool)) for each in pairs.problems)
+        return pairs.with_problems(none)
 
     monkeypatch.setattr(hj, "eigenpairs", unconverged)
     code = main(["hks", str(npz), "-o", str(tmp_path / "out"), "-k", "10"])

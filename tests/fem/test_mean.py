@@ -8,6 +8,8 @@ from fields import flat, random_spd
 from scipy.spatial import Delaunay
 
 import hks_jax as hj
+from hks_jax.eigen import doubled
+from hks_jax.eigen.one_pencil import pairs_of_pencil
 
 RIM_COEFFICIENT = np.sqrt(np.pi) / 4
 """4πt·HKS is 1 + this times κ√t on a rim of curvature κ."""
@@ -218,12 +220,35 @@ def test_bad_boundaries_are_named(rng):
         hj.assemble(flat((5, 5), (1.0, 1.0)), ("neumann", "neumann", "dirichlet"))
 
 
+@pytest.mark.parametrize(
+    ("shape", "lengths"),
+    [
+        ((14, 12, 6), (2.0, 1.7, 0.8)),  # the even problem has 88 of the 120 lowest eigenvalues
+        pytest.param((9, 9, 9), (1.0, 1.0, 1.0), marks=pytest.mark.slow),
+        pytest.param((34, 9), (4.0, 1.0), marks=pytest.mark.slow),
+    ],
+)
+def test_each_problem_of_a_doubled_domain_is_solved_once(shape, lengths, monkeypatch):
+    """The shares follow Weyl's law with its boundary term, which grows like k^(2/3) in 3D and like √k in 2D."""
+    sizes = []
+
+    def counting(pencil, solver, k, *more):
+        sizes.append(k)
+        return pairs_of_pencil(pencil, solver, k, *more)
+
+    monkeypatch.setattr(doubled, "pairs_of_pencil", counting)
+    pairs = hj.eigenpairs(flat(shape, lengths), 120, "mean", "shift-invert", multiplet="drop")
+    assert len(sizes) == 2
+    assert [each.k for each in pairs.problems] == sizes
+    assert sum(int(each.kept.sum()) for each in pairs.problems) == int(pairs.kept.sum())
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("boundary", ["mean", "mirror", ("mirror", "mean")])
 def test_a_part_that_others_include_has_no_more_than_its_share_of_pairs(boundary, rng):
     field = hj.TensorField(hj.Grid((9, 8), 0.1), random_spd(rng, (9, 8)))
     pairs = hj.eigenpairs(field, 60, boundary)
-    counts = np.bincount(np.asarray(pairs.part), minlength=len(pairs.pencil.parts))
+    counts = np.array([each.kept.sum() for each in pairs.problems])
     shares = [60 // len(including) for including in pairs.pencil.including]
     assert (counts <= shares).all()
     assert sorted(map(len, pairs.pencil.including)) == ([1, 2] if len(shares) == 2 else [1, 2, 2, 4])

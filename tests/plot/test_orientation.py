@@ -16,6 +16,7 @@ from hks_jax.io import TensorVolume, read_tensors, save, save_tensors
 from hks_jax.io.repair import find_background
 from hks_jax.plot import Orientation, fit_panels, hks_panels, new_figure, orthogonal_slices, save_figure, scalar_image
 from hks_jax.plot.images import colours_of
+from hks_jax.plot.signature import SPAN
 
 SHAPE, SPACING, ORIGIN = (10, 9, 5), (2.0, 2.5, 3.0), (-5.0, -4.0, -3.0)
 STORAGES = [(order, turned) for order in permutations(range(3)) for turned in product((False, True), repeat=3)]
@@ -202,8 +203,8 @@ def test_without_a_place_in_space_nothing_is_turned(tmp_path):
     path = save(tmp_path / "hks.npz", values, flat, name="hks", extra={"times": [1.0]})
     for view in ("neurological", "radiological"):
         assert main(["plot", str(path), "-o", str(tmp_path / f"{view}.png"), "--view", view, "--title", "T", "-q"]) == 0
-    grid = hj.Grid((6, 5), (0.5, 1.0), (1.0, 2.0))
-    save_figure(hks_panels(values, [1.0], grid, cmap="viridis", suptitle="T"), tmp_path / "own.png")
+    grid, limits = hj.Grid((6, 5), (0.5, 1.0), (1.0, 2.0)), [tuple(np.quantile(values, SPAN).tolist())]
+    save_figure(hks_panels(values, [1.0], grid, limits=limits, label="HKS", suptitle="T"), tmp_path / "own.png")
     own = pixels(tmp_path / "own.png")
     for view in ("neurological", "radiological"):
         np.testing.assert_array_equal(pixels(tmp_path / f"{view}.png"), own)
@@ -315,7 +316,8 @@ def test_a_centre_of_zero_is_one_of_either_sign():
 def test_all_panels_of_a_figure_have_one_colour_map(rounding):
     near, flat, late = np.linspace(0.8, 1.3, 9), np.full(9, 2.0) + rounding, np.linspace(1.9, 2.4, 9)
     assert [each.cmap for each in colours_of([near, near, flat], (0, 1), centre=1.0)] == ["RdBu_r"] * 3
-    assert [each.cmap for each in colours_of([near, late, late], (0, 1), centre=1.0)] == ["viridis"] * 3
+    assert [each.cmap for each in colours_of([near, late, late], (0, 1), centre=1.0)] == ["RdBu_r"] * 3
+    assert [each.cmap for each in colours_of([near[:1], late, late], (0, 1), centre=1.0)] == ["viridis"] * 3
 
 
 @pytest.mark.slow

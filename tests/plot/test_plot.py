@@ -8,6 +8,7 @@ from annotations import unchecked
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from hks_jax import Grid, SurfaceMesh, TensorField
+from hks_jax.cli import main
 from hks_jax.domain.examples import ball_mesh, sphere_mesh
 from hks_jax.io import Result, TensorVolume
 from hks_jax.plot import (
@@ -495,9 +496,61 @@ def test_pictures_of_a_signature_name_it_and_the_distance_of_diffusion(normalisa
     report = {"settings": {"metric": "inverse", "normalisation": normalisation}}
     values = np.stack([np.linspace(0.9, 1.1, 30).reshape(6, 5)] * 2)
     figure = signature_panels(Result(place, values, np.array([2.0, 8.0]), report=report))
-    assert figure.get_suptitle() == f"{title}, metric D⁻¹\nD = 2 mm²/s, the median mean diffusivity"
+    assert figure.get_suptitle().startswith(f"{title}, metric D⁻¹\nD = 2 mm²/s, the median mean diffusivity")
     titles = [ax.get_title() for ax in figure.axes]
-    assert titles == ["$t$ = 2 s\n$\\sqrt{Dt}$ = 2 mm", "$t$ = 8 s\n$\\sqrt{Dt}$ = 4 mm"]
+    known = "mean diffusivity\nin $10^{-3}$ mm²/s"
+    assert titles == ["$t$ = 2 s\n$\\sqrt{Dt}$ = 2 mm", "$t$ = 8 s\n$\\sqrt{Dt}$ = 4 mm", known]
+    # The anatomy is grey and has the mean eigenvalues; axes have their unit, colour bars their quantity.
+    anatomy = figure.axes[2].images[0]
+    assert anatomy.get_cmap().name == "gray"
+    np.testing.assert_allclose(anatomy.get_array(), 2000.0)
+    assert [ax.get_xlabel() for ax in figure.axes] == ["mm"] * 3
+    assert [ax.get_ylabel() for ax in figure.axes] == ["mm", "", ""]
+    bars = [ax.child_axes[0].get_ylabel() for ax in figure.axes]
+    assert bars == [*[{"raw": "HKS in 1/s", "flat": r"$4\pi t$·HKS"}[normalisation]] * 2, ""]
+    # The title has the share of the values that the arrows stand for.
+    low, high = figure.axes[0].images[0].get_clim()
+    beyond = 100 * np.mean((values[0] < low) | (values[0] > high))
+    assert beyond > 10
+    assert f"arrows: up to {beyond:.2g} % of the values are beyond the colours" in figure.get_suptitle()
+
+
+@pytest.mark.parametrize("shape", [(16, 14), (10, 9, 6)])
+@pytest.mark.parametrize("normalisation", ["flat", "raw"])
+def test_slices_and_volumes_have_the_colours_of_one_rule(shape, normalisation, tmp_path, monkeypatch):
+    d, times = len(shape), np.array([2.0, 3.0])
+    rng, scale = np.random.default_rng(0), (4 * np.pi * times) ** (len(shape) / 2)
+    near = np.zeros((2, *shape))
+    near[:, 6:] = 1.0  # the boundary raises the values on more than a third of the nodes
+    flat = rng.uniform(0.9, 1.2, (2, *shape)) * np.where(near > 0, 4.0, 1.0)
+    values = flat / scale.reshape(2, *[1] * d) if normalisation == "raw" else flat
+    place = TensorVolume(np.broadcast_to(np.eye(d), (*shape, d, d)), (1.0,) * d, (0.0,) * d)
+    report = {"settings": {"normalisation": normalisation, "metric": "tensor"}}
+    Result(place, values, times, report=report, arrays={"influence": near}).save(tmp_path / "hks", ".npz")
+    drawn = []
+    monkeypatch.setattr("hks_jax.plot.save_figure", lambda figure, *_, **__: drawn.append(figure))
+    assert main(["plot", str(tmp_path / "hks.npz"), "-o", str(tmp_path / "x.png"), "--scaled", "-q"]) == 0
+    report, arrays = {"settings": {"normalisation": "flat"}}, {"influence": near}
+    own = signature_panels(Result(place, flat, times, report=report, arrays=arrays))
+    for figure in (drawn[0], own):
+        image = figure.axes[0].images[0]
+        assert image.get_cmap().name == "RdBu_r"
+        low, high = image.get_clim()
+        assert low + high == pytest.approx(2.0)
+        assert 1.19 < high < 1.201
+
+
+def test_a_surface_is_seen_from_two_sides_in_the_colours_of_all_pictures():
+    mesh = sphere_mesh(2)
+    values = 1 + 0.2 * np.asarray(mesh.vertices)[:, 2]
+    report = {"settings": {"normalisation": "flat"}}
+    figure = signature_panels(Result(mesh, values[None], np.array([0.25]), report=report))
+    front, back = (ax for ax in figure.axes if hasattr(ax, "elev"))
+    assert (front.elev, front.azim % 360) == (-back.elev, (back.azim + 180) % 360)
+    assert front.get_title() == "$t$ = 0.25\n$\\sqrt{t}$ = 0.5"
+    (bar,) = (ax for ax in figure.axes if not hasattr(ax, "elev"))
+    assert bar.get_ylabel() == r"$4\pi t$·HKS"
+    assert sum(bar.get_ylim()) == pytest.approx(2.0)  # about 1, for a flat metric
 
 
 def test_masked_values_stay_hidden_and_rules_without_meaning_are_refused():

@@ -5,8 +5,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import hks_jax as hj
 from hks_jax import compilation
 from hks_jax.compilation import jit_quickly
+
+
+@pytest.fixture
+def flags(monkeypatch):
+    """Return a function that sets XLA_FLAGS; the compiler is asked again what it knows."""
+
+    def set_flags(value):
+        monkeypatch.setenv("XLA_FLAGS", value)
+        compilation._understood.cache_clear()
+
+    yield set_flags
+    compilation._understood.cache_clear()
 
 
 def make_power():
@@ -34,23 +47,50 @@ def test_it_can_be_called_alone_and_within_transformations(use):
     assert use(make_power()) == 9
 
 
-def test_where_the_compiler_does_not_know_the_options_it_does_without(monkeypatch):
+def test_where_the_compiler_does_not_know_the_options_it_does_without(flags, monkeypatch):
     monkeypatch.setattr(compilation, "_OPTIONS", {"xla_of_another_time": True})
-    compilation._understood.cache_clear()
-    try:
-        power = make_power()
-        np.testing.assert_array_equal(power(jnp.arange(3.0), 2), [0, 1, 4])
-        assert not compilation._understood()
-    finally:
-        compilation._understood.cache_clear()
+    flags("")
+    power = make_power()
+    np.testing.assert_array_equal(power(jnp.arange(3.0), 2), [0, 1, 4])
+    assert not compilation._understood()
+    assert hj.compiler_options() == {}
 
 
-def test_options_that_the_environment_sets_are_left_alone(monkeypatch):
-    for flags, ours in [("--xla_backend_optimization_level=0", False), ("--xla_unrelated=1", True), ("", True)]:
-        monkeypatch.setenv("XLA_FLAGS", flags)
-        compilation._understood.cache_clear()
-        assert compilation._understood() == ours
-    compilation._understood.cache_clear()
+def test_options_that_the_environment_sets_are_left_alone(flags):
+    for given, ours in [("--xla_backend_optimization_level=0", False), ("--xla_unrelated=1", True), ("", True)]:
+        flags(given)
+        assert compilation._understood() == bool(hj.compiler_options()) == ours
+
+
+def test_public_options_change_no_value_and_no_gradient(flags):
+    flags("")
+    options = hj.compiler_options()
+    field = hj.examples.sphere_field(9, 1.0)
+
+    def total(tensors):
+        pairs = hj.eigenpairs(hj.TensorField(field.grid, tensors), k=12, multiplet="drop")
+        return jnp.sum(hj.hks(pairs, [0.1, 0.3]))
+
+    function = jax.value_and_grad(total)
+    fast, usual = (jax.jit(function, compiler_options=each)(field.tensors) for each in (options, {}))
+    assert set(options) == set(compilation._OPTIONS)
+    np.testing.assert_allclose(fast[0], usual[0], rtol=1e-12)
+    np.testing.assert_allclose(fast[1], usual[1], rtol=0, atol=1e-10 * np.abs(usual[1]).max())
+    assert options is not hj.compiler_options()  # a change of the dictionary changes no other caller's
+
+
+def test_an_accelerator_has_no_options(flags, monkeypatch):
+    flags("")
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert hj.compiler_options() == {}
+
+
+@pytest.mark.parametrize("use", [jax.grad, jax.jit])
+def test_options_belong_to_the_outermost_function(flags, use):
+    flags("")
+    compiled = jax.jit(jnp.sin, compiler_options=hj.compiler_options())
+    with pytest.raises(ValueError, match="top-level"):
+        use(compiled)(1.0)
 
 
 def test_the_function_keeps_its_name_and_words():

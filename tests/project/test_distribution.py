@@ -58,6 +58,27 @@ def test_one_version_and_one_address():
     assert first in ("Unreleased", hj.__version__)
 
 
+def test_a_released_version_has_a_date_and_no_other_has():
+    changes, citation = ((ROOT / name).read_text(encoding="utf-8") for name in ("CHANGELOG.md", "CITATION.cff"))
+    heading = re.search(r"^## .*", changes, re.MULTILINE)[0]
+    assert bool(re.search(r"^date-released: \d{4}-\d\d-\d\d$", citation, re.MULTILINE)) == (
+        "not yet released" not in heading and "Unreleased" not in heading
+    )
+
+
+def test_the_workflows_run_every_target_of_ci_and_exist_in_the_makefile():
+    lists = re.findall(
+        r"^(?:for target in (.*); do|make --jobs.*\" (.*))$", (ROOT / ".ci/run").read_text("utf-8"), re.M
+    )
+    everything = set(" ".join(map(" ".join, lists)).split()) - {"tools"}  # which only installs
+    assert {"test", "lint", "dist"} <= everything
+    defined = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE))
+    workflows = [path.read_text(encoding="utf-8") for path in (ROOT / ".github/workflows").glob("*.yml")]
+    called = set(" ".join(re.findall(r"- run: make ([a-z -]+)$", "\n".join(workflows), re.MULTILINE)).split())
+    listed = {t for text in workflows for found in re.findall(r"target: \[(.*)\]", text) for t in found.split(", ")}
+    assert everything <= called | listed <= defined
+
+
 def test_every_link_of_the_description_is_absolute_and_leads_somewhere():
     """The rules that the build applies to README.md; `make dist` looks at their result in the wheel."""
     description = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -73,6 +73,14 @@ def test_tables_and_plots_are_what_was_measured(tables):
     assert tables.differences() == []
 
 
+def test_the_list_of_references_is_that_of_the_bibliography(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "docs" / "hooks")
+    references = importlib.import_module("references")
+    page = references.PAGE.read_text(encoding="utf-8")
+    assert references.filled() == page
+    assert page.count("\n- ") == len(references.entries()) == references.BIBLIOGRAPHY.read_text("utf-8").count("\n@")
+
+
 def test_a_changed_result_and_one_shown_nowhere_are_told(tables, monkeypatch):
     stored, named = tables.load, tables.named()
     rows = [{"way": "one by one", "seconds": 0.5, "first_call_s": 0.5}]
@@ -89,6 +97,22 @@ def test_a_table_has_the_rows_that_its_request_chooses(tables, monkeypatch):
     assert shown.splitlines()[2:] == ["| SLEPc, slicing | 1.5 |", "| LaPy | — |"]
     with pytest.raises(ValueError, match="no row"):
         tables.table("any", ["solver=none", "seconds"])
+
+
+def test_an_overview_has_the_times_of_each_program_and_dashes_where_there_are_none(tables):
+    def measured(file, column, **wanted):
+        (row,) = (row for row in tables.load(file)["rows"] if all(row.get(n) == v for n, v in wanted.items()))
+        return tables.text(row[column])
+
+    lines = tables.overview(["256²/500", "32³/200"], ROOT / "README.md").splitlines()
+    plane, gradient, volume = ([cell.strip() for cell in line.split("|")[2:-1]] for line in lines[2:5])
+    assert plane[0] == measured("eigensolvers", "seconds", nodes=65536, k=500, solver="eigsh, SuperLU")
+    assert plane[3] == measured("derivatives", "value_s", problem="256²")
+    assert gradient[:2] == ["—", "—"]
+    assert gradient[2] == measured("derivatives", "gradient_first_s", problem="256²")
+    assert gradient[5] == measured("accelerator_h200", "seconds", nodes=65536, k=500, way="gradient of the HKS")
+    assert volume[0] == measured("volumes", "seconds", nodes=32768, solver="eigsh, SuperLU")
+    assert volume[1] == volume[4] == "—"
 
 
 @pytest.mark.parametrize(

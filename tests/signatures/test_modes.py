@@ -79,7 +79,7 @@ def inner(pairs, u, v):
 
 
 def even(pairs):
-    return np.asarray(pairs.of_part(0).kept)
+    return np.asarray(pairs.kept) & (np.asarray(pairs.problem_numbers) == 0)
 
 
 @on(*PENCILS)
@@ -138,7 +138,7 @@ def test_filters_are_heat_flow_and_spectral_signatures(name, rng):
     at_most = 1e-11 if pairs.pencil.parts[0].row_sums is None else 2e-2
     np.testing.assert_allclose(hj.reconstruct(pairs, c), flow[0], atol=at_most)
     # The columns of the filter are those of the signature: a map that is 1/weight at one node.
-    if pairs.pencil.parts[0].row_sums is None and pairs.part is None:
+    if pairs.pencil.parts[0].row_sums is None and len(pairs.problems) == 1:
         node = tuple(np.argwhere(pairs.space.free)[4])
         mass = np.asarray(pairs.pencil.mass.to_dense())
         delta = np.asarray(pairs.space.extend(jnp.asarray(np.linalg.inv(mass)[4]), outside=0.0))
@@ -416,8 +416,7 @@ def test_surrogates_of_given_groups_and_of_doubled_domains(rng):
 def rotated(pairs, rng):
     """Return the pairs in other bases of their eigenspaces, and the matrix."""
     q = np.zeros((pairs.k, pairs.k))
-    labels, part = np.asarray(pairs.multiplets), 0 if pairs.part is None else np.asarray(pairs.part)
-    labels = 4 * labels + part
+    labels = np.asarray(pairs.multiplets)
     for label in np.unique(labels):
         own = np.flatnonzero(labels == label)
         q[np.ix_(own, own)] = np.linalg.qr(rng.standard_normal((len(own), len(own))))[0]

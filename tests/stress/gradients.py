@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -204,7 +203,7 @@ def _with_pairs(configuration: Configuration, base: Any, other: Any, kept: Any, 
     points, times = (other, base) if configuration.by == "times" else (base, other)
     pairs = _pairs(configuration, points, dense)
     if dense:
-        pairs = eqx.tree_at(lambda p: p.kept, pairs, jnp.arange(pairs.k) < kept)
+        pairs = pairs.keeping(jnp.arange(pairs.k) < kept)
     centre = tuple(n // 3 for n in configuration.shape) if configuration.shape else 5
     functions: dict[str, Callable[[], Any]] = {
         "hks": lambda: hj.hks(pairs, times),

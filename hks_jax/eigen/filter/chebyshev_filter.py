@@ -97,7 +97,7 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         moved = cropped(moved)
         assert isinstance(moved.space, GridSpace)
         plan = self.plan(k, moved.space)
-        compute = _compiled if is_traced(moved) else _lowest
+        compute = _compiled if is_traced(moved) else _iterate
         values, vectors = compute(moved, plan, self.max_rounds, report)
         values = values if pencil.null_space is not None else values + origin
         return values, vectors, jnp.asarray(jnp.nan, values.dtype)
@@ -118,7 +118,7 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         return FilterPlan(k, size, self.block, space.n_null, self.tolerance, mesh)
 
 
-def _lowest(pencil: Pencil, plan: FilterPlan, max_rounds: int, report: Report) -> Pairs:
+def _iterate(pencil: Pencil, plan: FilterPlan, max_rounds: int, report: Report) -> Pairs:
     grids = [_replicated(plan.mesh, GridFilter(nodal, upper_end(nodal), plan)) for nodal in _nested(pencil, plan)]
     grid = grids.pop()
     state, rounds = grid.from_random(pencil.volume), _FIRST_ROUNDS
@@ -136,7 +136,7 @@ def _lowest(pencil: Pencil, plan: FilterPlan, max_rounds: int, report: Report) -
     return state.values[: plan.wanted], pencil.space.restrict(vectors)
 
 
-_compiled = jax.jit(_lowest, static_argnames=("plan", "max_rounds", "report"))
+_compiled = jax.jit(_iterate, static_argnames=("plan", "max_rounds", "report"))
 
 
 def _converge(grid: GridFilter, rounding: Array, state: FilterState, max_rounds: int, report: Report) -> FilterState:

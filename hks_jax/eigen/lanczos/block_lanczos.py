@@ -104,7 +104,7 @@ class BlockLanczos(Eigensolver[SymmetricPencil]):
             return both
 
         state, stored = while_loop(lambda both: unfinished(plan, both[0]), step, first_state(problem, plan))
-        values, vectors, bound = _lowest(problem.pencil, state.values, stored, state.complete_below, k)
+        values, vectors, bound = _ordered(problem.pencil, state.values, stored, state.complete_below, k)
         if is_traced(bound) or (state.finished and not math.isnan(bound)) or problem.pencil.size > _DENSE:
             return values, vectors, bound
         report("slicing missed pairs: computing all pairs with the dense solver")
@@ -142,7 +142,7 @@ def _moved(pencil: SymmetricPencil, origin: Scalar, first: Scalar, spacing: Scal
 
 
 @jit_quickly(static_argnames="k")
-def _lowest(
+def _ordered(
     pencil: SymmetricPencil, values: Float[Array, " capacity"], vectors: Stored, bound: Float[Array, ""], k: int
 ) -> RawPairs:
     """Return the k lowest pairs (NaN if missing) and the certified bound (NaN if an eigenvector was found twice)."""
