@@ -132,7 +132,7 @@ CALLS: dict[str, Callable[[], Any]] = {
 }
 """Calls by the names of the functions, some with a further word."""
 
-OTHERS = {"keep_compiled", "fit_metric", "identifiability"}
+OTHERS = {"compiler_options", "keep_compiled", "fit_metric", "identifiability"}
 """Public functions without a call here: one changes a setting, and the others run the solvers of optimistix."""
 
 STEPS: dict[str, Callable[[Any], Any]] = {

@@ -258,7 +258,7 @@ def _tell_of_resolution(
 ) -> None:
     """Say which times k eigenpairs will resolve, by Weyl's law, and how many pairs half of the length takes."""
     d, place, unit, lengths = pencil.space.dimension, domain.place, "", None
-    if d is None or pencil.volume is None:
+    if d is None or pencil.volume is None or k < 1:
         return
     t = RESOLVED[d] / float(weyl(k, float(pencil.volume), d))
     if isinstance(place, TensorVolume):
