@@ -1,8 +1,7 @@
 """Report progress on stderr: the stage, the elapsed and the remaining time, and warnings of the library.
 
-tqdm and rich draw bars for a known number of equal steps. Stages here have no such number, only a solver's estimate of
-the remaining time, and a log file gets a line every few seconds: rich writes nothing to it before the end, and tqdm
-writes one line of carriage returns.
+tqdm and rich estimate the remaining time from counted steps; here, the solver estimates it. A log file gets a line every
+few seconds, where rich writes nothing before the end, and tqdm writes one line with carriage returns.
 """
 
 import io
