@@ -43,6 +43,8 @@ HEADINGS = {
     "first_step_s": "first step, s",
     "step_s": "a step, s",
     "processor_s": "of all processors, s",
+    "numpy_s": "NumPy's product, s",
+    "maps_MB": "maps, MB",
     "compilation_s": "compilation, s",
     "first_call_s_ratio": "ratio",
     "seconds_ratio": "ratio",

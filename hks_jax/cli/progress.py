@@ -1,4 +1,8 @@
-"""Report progress on stderr: the stage, the elapsed and the remaining time, and warnings of the library."""
+"""Report progress on stderr: the stage, the elapsed and the remaining time, and warnings of the library.
+
+tqdm and rich estimate the remaining time from counted steps; here, the solver estimates it. A log file gets a line
+every few seconds, where rich writes nothing before the end, and tqdm writes one line with carriage returns.
+"""
 
 import io
 import shutil

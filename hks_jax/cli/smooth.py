@@ -116,7 +116,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
             f"Pass {remedy} without these {where}"
         )
     with progress.stage("smoothing", f"{len(maps)} maps at {int(inside.sum())} {where}"):
-        smoothed = np.asarray(smooth(field, maps, args.fwhm, args.boundary))
+        smoothed = np.asarray(smooth(field, maps, args.fwhm, args.boundary, progress=progress.update))
     chosen = ("fwhm", "operator", "interpolation", "boundary", "dtype", "components")
     report = {
         "input": {**domain.about, "maps": {"source": str(args.file), "number": len(maps)}},

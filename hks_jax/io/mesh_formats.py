@@ -1,6 +1,9 @@
 """Read meshes through meshio, polygonal data through VTK, and variants of OBJ and OFF that meshio does not support.
 
-In a damaged file, meshio may omit points or cells without an error, so this module checks their numbers.
+In a damaged file, meshio may omit points or cells without an error, so this module checks their numbers. The readers of
+OBJ and OFF are the package's own: trimesh reads OFF files that are cut or declare other numbers of vertices and faces,
+and cuts concave quadrilaterals into triangles outside of them; meshio reads only triangles in OFF, and keeps corners of
+OBJ that count backwards or do not exist.
 """
 
 import math

@@ -1,7 +1,9 @@
-"""Read and write tensors (of all kinds that NRRD defines), masks and results through the optional library pynrrd."""
+"""Read and write tensors (of all kinds that NRRD defines), masks and results through the optional library pynrrd.
 
-import bz2
-import gzip
+pynrrd reads the header and the data. It accepts any name of a field, so that a damaged name would give a default, such
+as a spacing of 1: names and lengths of fields are checked here.
+"""
+
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -45,7 +47,6 @@ _SHORT = {"".join(word[0] for word in name.split("-")): name for name in _PATIEN
 _SPACES = (*_PATIENT, "scanner-xyz", "3d-right-handed", "3d-left-handed")
 
 _PER_AXIS = ("sizes", "spacings", "thicknesses", "kinds", "units", "space directions")
-_OPENED: dict[str, Any] = {"gzip": gzip.open, "gz": gzip.open, "bzip2": bz2.open, "bz2": bz2.open}
 
 
 class Placement(NamedTuple):
@@ -89,17 +90,13 @@ def load(name: str) -> tuple[np.ndarray, dict[str, Any]]:
         start = stream.tell()
         stream.seek(0)
         _check_header(stream.read(start), header)
-        _check_data(file, header, start)
         stream.seek(start)
         data = nrrd.read_data(header, stream, str(file), index_order="F")
     return data.astype(data.dtype.newbyteorder("=")), header
 
 
 def _check_header(text: bytes, header: Mapping[str, Any]) -> None:
-    """Raise ValueError for a header line that is neither a field nor a key, and for a field of wrong length.
-
-    Without an error, a field with a damaged name would have its default, such as a spacing of 1.
-    """
+    """Raise ValueError for a header line that is neither a field nor a key, and for a field of wrong length."""
     fields = _FIELDS.split(", ")
     for line in text.splitlines()[1:]:
         if line.startswith(b"#") or not line:
@@ -122,20 +119,6 @@ def _space_of(header: Mapping[str, Any]) -> str:
     if "space" in header and name not in _SPACES:
         raise ValueError(f"space: got {space!r}; expected a space of the format, such as left-posterior-superior")
     return name
-
-
-def _check_data(file: Path, header: Mapping[str, Any], start: int) -> None:
-    """Raise an error if compressed data are incomplete or fail their checksum; pynrrd checks uncompressed data."""
-    opened = _OPENED.get(str(header["encoding"]).lower())
-    if opened is None:
-        return
-    beside = header.get("data file", header.get("datafile"))
-    with open(file if beside is None else file.parent / str(beside), "rb") as source:
-        source.seek(start if beside is None else 0)
-        for _ in range(int(header.get("line skip", header.get("lineskip", 0)))):
-            source.readline()
-        with opened(source) as content:
-            content.read()
 
 
 def _read_image(name: str) -> tuple[np.ndarray, Float[np.ndarray, "4 4"] | None, str]:

@@ -1,4 +1,8 @@
-"""Read meshes in PLY: text and binary, with further elements and lists, such as edges and texture coordinates."""
+"""Read meshes in PLY: text and binary, with further elements and lists, such as edges and texture coordinates.
+
+meshio refuses such elements and lists. trimesh renumbers vertices with texture coordinates, has no numbers at vertices,
+and reads a mesh from files that are cut.
+"""
 
 import re
 from pathlib import Path

@@ -1,4 +1,7 @@
-"""Surfaces in space: meshes coloured by a scalar, and isosurfaces of a volume."""
+"""Surfaces in space: meshes coloured by a scalar, and isosurfaces of a volume.
+
+Matplotlib draws meshes, because it needs no display and no OpenGL. PyVista, where it is installed, draws isosurfaces.
+"""
 
 import math
 import os

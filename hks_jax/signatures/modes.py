@@ -370,10 +370,12 @@ def _chosen(xp: Any, modes: Any, kept: Any) -> Any:
 @numpy_where_known()
 def _products(xp: Any, measure: Any, modes: Any, rows: Any, measured: Any) -> Any:
     """Return the inner products (s, k) of rows, which are 0 at unmeasured nodes, with the modes at measured nodes."""
-    weights = _weighted(xp, measure, rows)
-    if measured is not None:
-        weights = xp.where(measured[None], weights, 0)
-    return inner_products(modes, weights) if xp is jnp else weights @ modes.T
+    own = modes if measured is None else xp.where(measured[None], modes, 0)
+    if len(own) < len(rows):  # the mass is symmetric: it multiplies the smaller factor
+        own = _weighted(xp, measure, own)
+    else:
+        rows = _weighted(xp, measure, rows)
+    return inner_products(own, rows) if xp is jnp else rows @ own.T
 
 
 def _gram(measure: Any, modes: Any, measured: Any, kept: Any) -> Float[Array, "k k"]:

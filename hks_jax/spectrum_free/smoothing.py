@@ -1,6 +1,8 @@
 """Smoothing of maps along the tissue, by the heat flow of a domain without eigenpairs."""
 
 import math
+import time as clock
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -13,16 +15,20 @@ from hks_jax.arrays import nan_is_meant
 from hks_jax.checks import real_array, require_number
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
+from hks_jax.eigen.solver import Report, Status, silent
 from hks_jax.fem.assembly import assemble
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.nodal import cropped
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.resolution import mean_diffusivity
+from hks_jax.linear import accelerators
 from hks_jax.linear.chebyshev import chebyshev_heat_coefficients, chebyshev_recurrence, least_degree
 from hks_jax.traced import is_traced
 
 _OMITTED = 1e-10
 """The greatest sum of the omitted Chebyshev coefficients in double precision."""
+_BLOCK = 16
+"""The largest number of maps that are smoothed together on a CPU, where larger blocks exceed the cache."""
 
 
 @nan_is_meant
@@ -32,6 +38,7 @@ def smooth(
     fwhm: float,
     boundary: BoundarySpec = "neumann",
     diffusivity: float | None = None,
+    progress: Report | None = None,
 ) -> Float[Array, "*functions_and_shape"]:
     """Smooth maps along the tissue: by the heat flow of the domain for the time in which its mean FWHM is reached.
 
@@ -58,6 +65,7 @@ def smooth(
         diffusivity: the D of the time FWHM²/(16 ln2 D). None means the mean of trace(T⁻¹)/d over the domain with the
             metric T, which for the metric D⁻¹ and for Fick's operator is the mean diffusivity (on a surface that of the
             tensors' tangential parts), and is 1 for a mesh without tensors.
+        progress: a function such as ``print`` that receives short texts during the smoothing of many concrete maps.
 
     Raises:
         ValueError: if f has another shape or is not finite inside the mask, if the FWHM is below the spacing, or if the
@@ -101,8 +109,25 @@ def smooth(
         )
     time = fwhm**2 / (16 * math.log(2.0) * diffusivity)
     degree = least_degree(time * top / 2, max(_OMITTED, float(jnp.finfo(dtype).eps)))
-    smoothed = _flow(degree, cropped(pencil), jnp.asarray(top, dtype), jnp.asarray(time, dtype), rows)
+    flow = partial(_flow, degree, cropped(pencil), jnp.asarray(top, dtype), jnp.asarray(time, dtype))
+    smoothed = flow(rows) if is_traced(rows) else _by_blocks(flow, rows, progress or silent)
     return space.extend(smoothed).reshape(u.shape)
+
+
+def _by_blocks(flow: Callable[[Array], Array], rows: Float[Array, "s n"], report: Report) -> Float[Array, "s n"]:
+    """Return the flow of all rows, computed for a few rows at a time; report the numbers of rows and the time left."""
+    count, begin = len(rows), clock.perf_counter()
+    if count <= _BLOCK or accelerators.at_hand():
+        return flow(rows)
+    done, size = list[Array](), -(-count // -(-count // _BLOCK))  # blocks of equal size are compiled once
+    for start in range(0, count, size):
+        block = rows[start : start + size]
+        padded = jnp.pad(block, ((0, size - len(block)), (0, 0)))
+        done.append(jax.block_until_ready(flow(padded))[: len(block)])
+        finished = start + len(block)
+        left = (clock.perf_counter() - begin) / finished * (count - finished)
+        report(Status(f"{finished} of {count} maps", left))
+    return jnp.concatenate(done)
 
 
 def _least_width(domain: TensorField | SimplicialMesh) -> tuple[str, float]:

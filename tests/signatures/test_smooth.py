@@ -61,6 +61,40 @@ def test_the_flow_of_all_eigenpairs_and_the_total(boundary, rng):
         np.testing.assert_allclose(after, before, rtol=1e-8, atol=1e-9)
 
 
+@pytest.mark.parametrize("boundary", ["neumann", "periodic", "mirror", "mean", "dirichlet"])
+def test_the_total_is_kept_but_under_dirichlet_conditions(boundary, rng):
+    """Also for maps at the boundary, and under Fick's operator with tensors that vary."""
+    shape = (8, 7)
+    field = hj.TensorField.from_diffusion(hj.Grid(shape, (1.0, 1.5)), random_spd(rng, shape), operator="fick")
+    spot = np.zeros(shape)
+    spot[0, 0] = 1
+    f = np.stack([spot, 1 + rng.random(shape), 1e-3 * np.ones(shape)])
+    found = np.asarray(hj.smooth(field, f, 4.0, boundary))
+    pencil = hj.assemble(field, boundary, "lumped").parts[0]
+    weights = np.asarray(pencil.space.extend(pencil.mass.diagonal()))
+    before, after = (np.nansum(weights * x, axis=(1, 2)) for x in (f, found))
+    if boundary == "dirichlet":
+        assert (after[1:] < 0.9 * before[1:]).all()
+    else:
+        np.testing.assert_allclose(after, before, rtol=1e-6)
+
+
+def test_a_series_is_smoothed_in_blocks_that_are_reported(rng):
+    """The maps of a long series are those smoothed one by one; the texts count them to the end."""
+    shape = (6, 5)
+    field = hj.TensorField.from_diffusion(hj.Grid(shape), random_spd(rng, shape), operator="fick")
+    f, texts = rng.standard_normal((2, 20, *shape)), []
+    found = hj.smooth(field, f, 3.0, progress=texts.append)
+    assert found.shape == f.shape
+    np.testing.assert_allclose(found[1, 19], hj.smooth(field, f[1, 19], 3.0), atol=1e-12)
+    np.testing.assert_allclose(found, jax.jit(lambda u: hj.smooth(field, u, 3.0))(f), atol=1e-12)
+    assert texts == ["14 of 40 maps", "28 of 40 maps", "40 of 40 maps"]
+    assert texts[0].seconds_left > 0
+    assert texts[-1].seconds_left == 0
+    hj.smooth(field, f[0, :3], 3.0, progress=texts.append)
+    assert len(texts) == 3  # a few maps need no report
+
+
 def cap():
     """A part of a sphere."""
     whole = hj.examples.sphere_mesh(2)
