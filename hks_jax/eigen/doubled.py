@@ -2,14 +2,14 @@
 
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.arrays import jax_array
 from hks_jax.compilation import numpy_where_known
@@ -24,9 +24,18 @@ Including = tuple[tuple[int, ...], ...]
 """See `MirrorPencil.including`."""
 
 
+def _array(of: Callable[[Any], Array]) -> Any:
+    """Return a property whose value is an array, or its shape if the pairs are shapes as in `jax.eval_shape`."""
+
+    def read(pairs: Any) -> Any:
+        return jax.eval_shape(of, pairs) if isinstance(pairs.order, jax.ShapeDtypeStruct) else of(pairs)
+
+    return property(read)
+
+
 def _merged(name: str) -> Any:
     """Return a property: the attribute of the problems' pairs, merged in ascending order of eigenvalues."""
-    return property(lambda pairs: pairs.merged([getattr(each, name) for each in pairs.problems]))
+    return _array(lambda pairs: pairs.merged([getattr(each, name) for each in pairs.problems]))
 
 
 class DoubledEigenpairs(Eigenpairs, eqx.Module):
@@ -34,11 +43,13 @@ class DoubledEigenpairs(Eigenpairs, eqx.Module):
 
     Attributes:
         problems: the eigenpairs of each problem; `kept` marks those that are among the k lowest of the doubled domain.
+        order: the places of the k lowest eigenvalues in the concatenated spectra of all problems.
         including: the inclusions of the problems' function spaces; see `MirrorPencil`.
         k: the number of pairs.
     """
 
     problems: tuple[PencilEigenpairs, ...]
+    order: Int[Array, " k"]
     including: Including = eqx.field(static=True)
     k: int = eqx.field(static=True)
 
@@ -50,40 +61,52 @@ class DoubledEigenpairs(Eigenpairs, eqx.Module):
 
     def merged(self, values: Sequence[Any]) -> Array:
         """Return the values (…, k) for each pair, given those for the pairs of each problem."""
-        return _in_order(list(values), self._spectra, self.including, self.k, -1)
+        return _in_order(list(values), self._known_order, -1)
+
+    @property
+    def _known_order(self) -> Int[Array, " k"]:
+        order = self.order
+        known = None if is_traced(order) or order.dtype == jax.dtypes.float0 else np.sort(np.asarray(order), axis=-1)
+        if order.dtype == jax.dtypes.float0 or (known is not None and (np.diff(known, axis=-1) == 0).any()):
+            raise ValueError(
+                'pairs: got a derivative or difference of eigenpairs with the boundary "mean" or "mirror", which does '
+                "not know the order of the eigenvalues. Differentiate a function that returns `pairs.eigenvalues` or "
+                "another attribute, not the pairs; or use the eigenpairs in `.problems`"
+            )
+        return order
 
     # An eigenfunction has norm 1 on the domain doubled m times, hence norm 1/√2ᵐ on the domain itself. The values at
     # the free nodes of the even problem, which has all free nodes, are 0 at Dirichlet nodes of the other problems.
     def _functions(self, of_problems: Sequence[Float[Array, "_k _n"]]) -> Float[Array, "k n_dof"]:
         rows = [each.space.transfer(own, self.space) for each, own in zip(self.problems, of_problems, strict=True)]
-        return _in_order(rows, self._spectra, self.including, self.k, -2) / math.sqrt(len(rows))
+        return _in_order(rows, self._known_order, -2) / math.sqrt(len(rows))
 
-    @view
+    @_array
     def vectors(self) -> Float[Array, "k n_dof"]:
         """The coefficients of the eigenfunctions, with norm 1 on the doubled domain."""
         return self._functions([each.vectors for each in self.problems])
 
-    @view
+    @_array
     def at_nodes(self) -> Float[Array, "k n_dof"]:
         """The eigenfunctions' values at the free nodes."""
         return self._functions([each.at_nodes for each in self.problems])
 
-    @view
+    @_array
     def next_eigenvalue(self) -> Float[Array, ""]:
         """The first eigenvalue that is not kept."""
         return _over([each.next_eigenvalue for each in self.problems], "nanmin")
 
-    @view
+    @_array
     def complete_below(self) -> Float[Array, ""]:
         """The bound below which none of the eigenvalues is missing in any problem."""
         return _over([each.complete_below for each in self.problems], "min")
 
-    @view
+    @_array
     def spectral_origin(self) -> Float[Array, ""]:
         """The origin of the even problem, whose lowest eigenvalue is the lowest of all."""
         return self.problems[0].spectral_origin
 
-    @view
+    @_array
     def multiplet_tolerance(self) -> Float[Array, ""]:
         """The largest tolerance of all problems."""
         return _over([each.multiplet_tolerance for each in self.problems], "max")
@@ -105,18 +128,15 @@ class DoubledEigenpairs(Eigenpairs, eqx.Module):
 
     def keeping(self, kept: Bool[Array, " k"]) -> "DoubledEigenpairs":
         """Keep only the marked pairs, the lowest ones, which are the lowest ones of each problem."""
-        own = _split(jax.lax.stop_gradient(self._spectra), kept, self.including, self.k)
+        own = _split(self.order, kept, tuple(each.k for each in self.problems))
         return self.with_problems(each.keeping(mask) for each, mask in zip(self.problems, own, strict=True))
-
-    @property
-    def _spectra(self) -> list[Float[Array, " _k"]]:
-        return [each.eigenvalues for each in self.problems]
 
 
 # If the function space of problem B includes that of problem A, the j-th eigenvalue of A is not below the j-th
 # eigenvalue of B. If the j-th eigenvalues of both problems are equal, rounding may exchange their order, so that A
 # could have more of the lowest eigenvalues of the doubled domain than `MirrorPencil.including` allows. So eigenvalues
 # are sorted by the maximum of a problem's j-th eigenvalue and those of all problems that include this problem.
+@numpy_where_known(static_argnums=(1, 2))
 def _order(xp: Any, spectra: Any, including: Including, k: int) -> Any:
     """Return the places (…, k) of the k lowest eigenvalues in the concatenated spectra of all problems."""
     keys: list[Any] = []
@@ -128,10 +148,16 @@ def _order(xp: Any, spectra: Any, including: Including, k: int) -> Any:
     return xp.argsort(xp.concatenate(keys, axis=-1), axis=-1, stable=True)[..., :k]
 
 
-@numpy_where_known(static_argnums=(2, 3, 4))
-def _in_order(xp: Any, values: Any, spectra: Any, including: Including, k: int, axis: int) -> Any:
+def doubled_pairs(problems: Sequence[PencilEigenpairs], including: Including, k: int) -> DoubledEigenpairs:
+    """Return the k lowest pairs of all problems; see `MirrorPencil` for ``including``."""
+    order = _order([jax.lax.stop_gradient(each.eigenvalues) for each in problems], including, k)
+    return DoubledEigenpairs(tuple(problems), order, including, k)
+
+
+@numpy_where_known(static_argnums=2)
+def _in_order(xp: Any, values: Any, order: Any, axis: int) -> Any:
     """Return the values of all problems, along an axis, in the order of the k lowest eigenvalues."""
-    order, whole = _order(xp, spectra, including, k), xp.concatenate(values, axis=axis)
+    whole = xp.concatenate(values, axis=axis)
     if order.ndim == 1:
         return xp.take(whole, order, axis=axis)
     return xp.take_along_axis(whole, order if axis == -1 else order[..., None], axis=axis)
@@ -142,11 +168,10 @@ def _over(xp: Any, values: Any, name: str) -> Any:
     return getattr(xp, name)(xp.stack(values), axis=0)
 
 
-@numpy_where_known(static_argnums=(2, 3))
-def _split(xp: Any, spectra: Any, kept: Any, including: Including, k: int) -> Any:
+@numpy_where_known(static_argnums=2)
+def _split(xp: Any, order: Any, kept: Any, sizes: tuple[int, ...]) -> Any:
     """Return the mask of each problem's pairs that are among the kept ones of the k lowest."""
-    sizes = [len(each) for each in spectra]
-    problem = xp.asarray(np.repeat(np.arange(len(sizes)), sizes))[_order(xp, spectra, including, k)]
+    problem = xp.asarray(np.repeat(np.arange(len(sizes)), sizes))[order]
     return [xp.arange(size) < xp.sum(kept & (problem == i)) for i, size in enumerate(sizes)]
 
 
@@ -182,7 +207,7 @@ def pairs_of_doubled(
         for i in short:
             wanted[i] = min(limits[i], 2 * wanted[i])
             solved[i] = solve(i, report)
-    return DoubledEigenpairs(tuple(solved), pencil.including, k).keeping(jax_array(np.ones(k, bool)))
+    return doubled_pairs(solved, pencil.including, k).keeping(jax_array(np.ones(k, bool)))
 
 
 def _limits(pencil: MirrorPencil, k: int) -> list[int]:

@@ -52,7 +52,9 @@ class Eigenpairs(ABC):
 
     The derivatives of signatures with respect to the matrices use the pencil, not `eigenvalues`. So do not rescale
     `eigenvalues`: derivatives of signatures would then refer to the new array, not to the matrices. Rescale times or
-    the pencil instead.
+    the pencil instead. Differentiate functions that return attributes, such as `vectors`, not functions that return
+    the pairs: the vectors of a tangent of pairs lack rotations. For the boundaries "mirror" and "mean", attributes are
+    views of the arrays in `problems`, which are the leaves of the pytree.
 
     Attributes:
         eigenvalues: (k,) in ascending order, in 1/(metric length)²; exactly 0 for null vectors.

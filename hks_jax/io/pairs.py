@@ -10,7 +10,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from hks_jax.eigen.doubled import DoubledEigenpairs
+from hks_jax.eigen.doubled import doubled_pairs
 from hks_jax.eigen.eigenpairs import Eigenpairs, PencilEigenpairs
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil
 from hks_jax.storage import load_npz, write_npz
@@ -95,7 +95,7 @@ def pairs_of(name: str, arrays: Mapping[str, np.ndarray], pencil: AnyPencil) -> 
     pairs: Eigenpairs
     if isinstance(pencil, MirrorPencil):
         problems = (_of_problem(values, pencil, number) for number in range(len(pencil.parts)))
-        pairs = DoubledEigenpairs(tuple(problems), pencil.including, k)
+        pairs = doubled_pairs(list(problems), pencil.including, k)
     else:
         pairs = PencilEigenpairs(frame=values.pop("vectors"), pencil=pencil, **values)
     gap = np.concatenate([_residuals(each) for each in pairs.problems])

@@ -254,3 +254,21 @@ def test_a_part_that_others_include_has_no_more_than_its_share_of_pairs(boundary
     assert sorted(map(len, pairs.pencil.including)) == ([1, 2] if len(shares) == 2 else [1, 2, 2, 4])
     traced = jax.jit(lambda t: hj.eigenpairs(hj.TensorField(field.grid, t), 60, boundary).eigenvalues)(field.tensors)
     np.testing.assert_allclose(traced, pairs.eigenvalues, atol=1e-9 * pairs.eigenvalues[-1])
+
+
+def test_pairs_that_are_shapes_or_tangents(rng):
+    tensors = jnp.asarray(random_spd(rng, (5, 6)))
+
+    def pairs(tensors):
+        return hj.eigenpairs(hj.TensorField(hj.Grid((5, 6), 0.25), tensors), 6, "mean")
+
+    shapes = jax.eval_shape(pairs, tensors)
+    assert (shapes.eigenvalues.shape, shapes.vectors.shape, shapes.next_eigenvalue.shape) == ((6,), (6, 30), ())
+    assert "k=6" in repr(shapes)
+    tangent = jax.jvp(pairs, (tensors,), (tensors,))[1]
+    both = pairs(tensors), pairs(2 * tensors)
+    for wrong in (tangent, jax.tree.map(lambda a, b: a - b if a.dtype.kind != "b" else a, *both)):
+        with pytest.raises(ValueError, match="does not know the order of the eigenvalues"):
+            _ = wrong.eigenvalues
+    change = jax.jvp(lambda x: pairs(x).eigenvalues, (tensors,), (tensors,))[1]  # λ of the metric cT is λ/c
+    np.testing.assert_allclose(change, -both[0].eigenvalues, rtol=1e-9, atol=1e-12)

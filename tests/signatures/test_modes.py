@@ -417,13 +417,16 @@ def test_surrogates_of_given_groups_and_of_doubled_domains(rng):
 
 def rotated(pairs, rng):
     """Return the pairs in other bases of their eigenspaces, and the matrix."""
-    q = np.zeros((pairs.k, pairs.k))
-    labels = np.asarray(pairs.multiplets)
-    for label in np.unique(labels):
-        own = np.flatnonzero(labels == label)
+    q, problems = np.zeros((pairs.k, pairs.k)), []
+    labels, numbers = np.asarray(pairs.multiplets), np.asarray(pairs.problem_numbers)
+    for label, number in {*zip(labels, numbers, strict=True)}:
+        own = np.flatnonzero((labels == label) & (numbers == number))
         q[np.ix_(own, own)] = np.linalg.qr(rng.standard_normal((len(own), len(own))))[0]
-    moved = eqx.tree_at(lambda p: p.frame, pairs, q @ pairs.frame)
-    return moved, q
+    for number, each in enumerate(pairs.problems):
+        own = np.flatnonzero(numbers == number)
+        frame = each.frame.at[: len(own)].set(q[np.ix_(own, own)] @ each.frame[: len(own)])
+        problems.append(eqx.tree_at(lambda p: p.frame, each, frame))
+    return pairs.with_problems(problems), q
 
 
 @pytest.mark.parametrize("way", ["landmarks", pytest.param("maps", marks=pytest.mark.slow)])
