@@ -50,7 +50,7 @@ enough = 3 << 30
 def forget_what_was_compiled() -> Iterator[None]:
     """Clear the caches when the process has come to 3 GiB: a thousand tests compile more than fits into memory.
 
-    That takes seconds, and what is freed serves again before the process grows: they are cleared when it has grown.
+    Clearing takes seconds, and freed memory is used again first; so caches are cleared only if the process has grown.
     """
     global enough
     yield

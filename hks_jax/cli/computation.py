@@ -232,7 +232,7 @@ def domain_of_volume(volume: TensorVolume, settings: Settings, image: str = "") 
 
 
 def compute_pairs(domain: OfVolume | OfMesh, settings: Settings, progress: Progress) -> Solved:
-    """Compute the eigenpairs of a domain."""
+    """Compute the eigenpairs of a domain; raise ComputationError unless all converge."""
     boundary, field = settings.boundary, domain.field
     if isinstance(field, hj.TensorField):
         inside, nodes = field.grid.inside, f"{int(field.grid.inside.sum())} of {field.grid.size} nodes"
@@ -250,7 +250,16 @@ def compute_pairs(domain: OfVolume | OfMesh, settings: Settings, progress: Progr
     assert dimension is not None
     k = default_k(dimension, unknowns) if settings.k is None else settings.k
     _tell_of_resolution(k, pencil, domain, settings, progress)
-    return Solved(domain, _solve(pencil, k, settings.solver, progress), replace(settings, boundary=boundary))
+    solver = choose_solvers(settings.solver, pencil, k)[0]
+    with progress.stage("eigenpairs", f"{k} of {unknowns} by {solver.name}"):
+        # The two problems of "mean" may get different solvers by name, so the name is handed on.
+        loose = isinstance(solver, hj.ChebyshevFilter)
+        chosen = replace(solver, tolerance=_TOLERANCE) if loose else settings.solver
+        pairs = hj.eigenpairs(pencil, k, solver=chosen, progress=progress.update)
+        jax.block_until_ready(pairs.eigenvalues)
+    if not np.asarray(pairs.converged).all():
+        raise ComputationError(pairs.messages()[0])
+    return Solved(domain, pairs, replace(settings, boundary=boundary))
 
 
 def _tell_of_resolution(
@@ -258,28 +267,15 @@ def _tell_of_resolution(
 ) -> None:
     """Say which times k eigenpairs will resolve, by Weyl's law, and how many pairs half of the length takes."""
     d, place, unit, lengths = pencil.space.dimension, domain.place, "", None
-    if d is None or pencil.volume is None or k < 1:
+    if d is None or pencil.volume is None or k < 1:  # `eigenpairs` refuses such a k
         return
     t = RESOLVED[d] / float(weyl(k, float(pencil.volume), d))
     if isinstance(place, TensorVolume):
         metric = "inverse" if settings.operator == "fick" else settings.metric
         unit = unit_of_times(place, metric)
-        lengths = [math.sqrt(median_mean_diffusivity(place) * t)] if metric == "inverse" else None
+        lengths = [math.sqrt(domain.about["median_mean_diffusivity"] * t)] if metric == "inverse" else None
     (words,) = times_in_words([t], lengths, unit, getattr(place, "length_unit", ""))
     progress.note(f"k = {k} will resolve t ≥ about {words}; half of this √t takes {2**d} times as many eigenpairs")
-
-
-def _solve(pencil: hj.Pencil | hj.MirrorPencil, k: int, name: str, progress: Progress) -> hj.Eigenpairs:
-    """Compute eigenpairs by the named solver; raise ComputationError unless all converge."""
-    unknowns, solver = sum(part.space.n_dof for part in pencil.parts), choose_solvers(name, pencil, k)[0]
-    # The choice of a solver by name may differ between the two problems of "mean", so the name is handed on.
-    chosen = replace(solver, tolerance=_TOLERANCE) if isinstance(solver, hj.ChebyshevFilter) else name
-    with progress.stage("eigenpairs", f"{k} of {unknowns} by {solver.name}"):
-        pairs = hj.eigenpairs(pencil, k, solver=chosen, progress=progress.update)
-        jax.block_until_ready(pairs.eigenvalues)
-    if not np.asarray(pairs.converged).all():
-        raise ComputationError(pairs.messages()[0])
-    return pairs
 
 
 def _signature(pairs: hj.Eigenpairs, times: tuple[float, ...], settings: Settings) -> tuple[np.ndarray, dict[str, Any]]:
@@ -330,7 +326,7 @@ def describe_pairs(pairs: hj.Eigenpairs) -> dict[str, Any]:
     values = np.asarray(pairs.eigenvalues)
     return {
         "k": pairs.k,
-        "unknowns": sum(part.space.n_dof for part in pairs.pencil.parts),
+        "unknowns": pairs.n_unknowns,
         "solver": pairs.solver_name,
         "zero": pairs.n_null,
         "first_positive": float(values[min(pairs.n_null, pairs.k - 1)]),

@@ -224,7 +224,7 @@ def _reviewed(volume: TensorVolume, reading: Reading, ask: Callable[[str], None]
         return volume
     volume, asked = reviewed(volume)
     for question in asked:
-        if getattr(reading, "strict_unit", False) and not volume.unit and question == unit_question(volume):
+        if reading.strict_unit and not volume.unit and question == unit_question(volume):
             raise ValueError(
                 f"{reading.file}: {question}. The tensors of all subjects must have the same unit. If the "
                 "numbers are in mm²/s, pass --unit mm2/s, or add a column named unit to the table"

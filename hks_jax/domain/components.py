@@ -92,3 +92,10 @@ def label_nodes(mask: Bool[np.ndarray, "*shape"], periodic: tuple[bool, ...]) ->
         count, merged = connected_components(graph, directed=False)
         nodes = np.where(nodes > 0, merged[nodes - 1] + 1, 0)
     return nodes, int(count)
+
+
+def bounding_box(inside: Bool[np.ndarray, "*shape"], margin: int = 2) -> tuple[slice, ...]:
+    """Return the slices of the bounding box of the True entries, with a margin."""
+    (box,) = scipy.ndimage.find_objects(inside.astype(int))
+    ends = zip(box, inside.shape, strict=True)
+    return tuple(slice(max(part.start - margin, 0), min(part.stop + margin, n)) for part, n in ends)

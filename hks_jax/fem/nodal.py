@@ -11,6 +11,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float
 
+from hks_jax.domain.components import bounding_box
 from hks_jax.domain.grid import Grid
 from hks_jax.fem.halo import Slabs
 from hks_jax.fem.pencil import Pencil
@@ -115,8 +116,11 @@ def cropped(pencil: Pencil) -> Pencil:
     space = pencil.space
     if not isinstance(space, GridSpace):
         return pencil
-    box = tuple(slice(None) if wraps else _around(space.grid.inside, axis) for axis, wraps in enumerate(space.periodic))
-    inside = space.grid.inside[box]
+    # With a margin of a node, a new end of an axis is no side of the domain.
+    whole = space.grid.inside
+    around = zip(bounding_box(whole, margin=1), whole.shape, space.periodic, strict=True)
+    box = tuple(slice(None) if wraps else _rounded(part, n) for part, n, wraps in around)
+    inside = whole[box]
     if inside.size > _SAVED * space.free.size:
         return pencil
     small = grid_space(Grid(inside.shape, mask=inside, components="all"), space.boundary)
@@ -129,16 +133,11 @@ def cropped(pencil: Pencil) -> Pencil:
     return replace(pencil, **parts, metric=None, density=None, source=None)
 
 
-def _around(inside: Bool[np.ndarray, "*shape"], axis: int) -> slice:
-    """Return a slice of the nodes along an axis that contains the mask.
-
-    Between the mask and a new end of the axis is at least one node, so that the end is no side of the domain.
-    """
-    n, where = inside.shape[axis], np.flatnonzero(inside.any(axis=tuple(a for a in range(inside.ndim) if a != axis)))
-    first, last = max(where[0] - 1, 0), min(where[-1] + 1, n - 1)
-    size = min(-(-(last + 1 - first) // _ROUND) * _ROUND, n)
-    first = min(first, n - size)
-    return slice(int(first), int(first + size))
+def _rounded(part: slice, n: int) -> slice:
+    """Return a slice of n nodes that contains the given one, and whose length is a multiple of `_ROUND` if possible."""
+    size = min(-(-(part.stop - part.start) // _ROUND) * _ROUND, n)
+    first = min(part.start, n - size)
+    return slice(first, first + size)
 
 
 def to_columns(rows: Float[Array, "b nodes"], shape: tuple[int, ...]) -> Float[Array, "*shape b"]:

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from scipy import ndimage
 
 from hks_jax import Grid, SurfaceMesh, TetMesh
+from hks_jax.domain.components import bounding_box
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result, require_result
 from hks_jax.io.units import MM2_PER_S
@@ -242,13 +243,6 @@ def placed(volume: TensorVolume, box: Sequence[slice] | None, view: View) -> Ori
     affine = volume.affine.copy()
     affine[:, 3] += affine @ first
     return Orientation.of(affine, thin, view=view)
-
-
-def bounding_box(inside: Bool[np.ndarray, "*shape"], margin: int = 2) -> tuple[slice, ...]:
-    """Return the slices of the bounding box of the True entries, with a margin."""
-    (box,) = ndimage.find_objects(inside.astype(int))
-    ends = zip(box, inside.shape, strict=True)
-    return tuple(slice(max(part.start - margin, 0), min(part.stop + margin, n)) for part, n in ends)
 
 
 def away_from_rim(inside: Bool[np.ndarray, "*shape"]) -> Bool[np.ndarray, "*shape"]:

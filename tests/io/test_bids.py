@@ -1,4 +1,4 @@
-"""Names of BIDS, and what is found by them in trees as QSIRecon, QSIPrep, FSL and MRtrix write them."""
+"""BIDS names, and the inputs that they find in folders like those of QSIRecon, QSIPrep, FSL and MRtrix."""
 
 import json
 import re

@@ -9,6 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from hks_jax import Grid, SurfaceMesh, TensorField
 from hks_jax.cli import main
+from hks_jax.domain.components import bounding_box
 from hks_jax.domain.examples import ball_mesh, sphere_mesh
 from hks_jax.io import Result, TensorVolume
 from hks_jax.plot import (
@@ -28,7 +29,7 @@ from hks_jax.plot import (
 )
 from hks_jax.plot.glyphs import FILL
 from hks_jax.plot.modes import modes_panels
-from hks_jax.plot.signature import away_from_rim, bounding_box
+from hks_jax.plot.signature import away_from_rim
 
 
 def rotating_field(index, n=81, centre=(0.0, 0.0), mask=None):

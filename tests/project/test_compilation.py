@@ -12,7 +12,7 @@ from hks_jax.compilation import jit_quickly
 
 @pytest.fixture
 def flags(monkeypatch):
-    """Return a function that sets XLA_FLAGS; the compiler is asked again what it knows."""
+    """Return a function that sets XLA_FLAGS and forgets the compiler's earlier answer."""
 
     def set_flags(value):
         monkeypatch.setenv("XLA_FLAGS", value)

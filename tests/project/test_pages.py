@@ -21,7 +21,7 @@ def blocks(page):
 
 
 PAGES = {page.stem: page for page in sorted((ROOT / "docs").glob("*.md")) if blocks(page)}
-# The number of devices is set before JAX starts. The others share what they import and compile, in two processes.
+# The number of devices is set before JAX starts. The other pages share imports and compilations, in two processes.
 ALONE = ["devices"]
 TOGETHER = [name for name in PAGES if name not in ALONE]
 GROUPS = [ALONE, TOGETHER[::2], TOGETHER[1::2]]

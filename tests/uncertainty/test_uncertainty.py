@@ -236,7 +236,7 @@ def measured_often(D, signature, level, number, of):
 
 
 def compared_with_one(bars, truth):
-    """How often noise alone is beyond two, with the null subtracted and not, and what is declared on it."""
+    """The share of noise beyond two, with and without the null subtracted, and the discoveries in noise alone."""
     plain = (bars.value - 1) / bars.deviation
     low, high = bars.interval(0.95)
     outside = (bars.null < low) | (bars.null > high)

@@ -221,7 +221,7 @@ class _Task(NamedTuple):
         return {kind: why for kind, why in found.items() if why}
 
     def run(self, lacking: Iterable[str], progress: StudyProgress) -> None:
-        """Compute what is lacking; draw the picture last, so that a failure leaves the results."""
+        """Compute the lacking results; draw the picture last, so that results remain if drawing fails."""
         study, subject, result = self.study, self.subject, None
         if MAP in lacking:
             result = _compute(study, subject, self.fingerprint, progress)  # removes the picture and table of regions

@@ -17,13 +17,14 @@ from matplotlib import colormaps
 
 from hks_jax import __version__
 from hks_jax.checks import require_real
+from hks_jax.domain.components import bounding_box
 from hks_jax.domain.simplicial_mesh import SurfaceMesh, TetMesh
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result, require_result
 from hks_jax.io.units import MEDIAN, MM2_PER_S
 from hks_jax.plot.orientation import Orientation, View
 from hks_jax.plot.panels import checked_times
-from hks_jax.plot.signature import FICK, METRICS, bounding_box, placed
+from hks_jax.plot.signature import FICK, METRICS, placed
 from hks_jax.plot.volumes import middle_node
 from hks_jax.signatures.regions import region_statistics
 from hks_jax.signatures.times import FREE
