@@ -1,6 +1,5 @@
 """Save and load eigenpairs, so that signatures at other times need no new eigenvalue computation."""
 
-import math
 import os
 from collections.abc import Mapping
 from dataclasses import fields
@@ -12,7 +11,7 @@ import numpy as np
 
 from hks_jax.eigen.doubled import doubled_pairs
 from hks_jax.eigen.eigenpairs import Eigenpairs, PencilEigenpairs
-from hks_jax.fem.pencil import AnyPencil, MirrorPencil
+from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
 from hks_jax.storage import load_npz, write_npz
 
 ARRAYS = "vectors", *(f.name for f in fields(PencilEigenpairs) if f.name not in ("frame", "pencil", "solver_name"))
@@ -24,7 +23,8 @@ _FAR = 1e-3
 def save_pairs(path: str | os.PathLike[str], pairs: Eigenpairs, extra: Mapping[str, Any] | None = None) -> Path:
     """Write k eigenpairs for `load_pairs` to an uncompressed npz, which has about k numbers per degree of freedom.
 
-    The pencil is not written. To assemble the pencil again, keep the tensors and the mask, or pass both as `extra`.
+    For a doubled domain, the file contains the eigenpairs of each problem. The pencil is not written. To assemble the
+    pencil again, keep the tensors and the mask, or pass both as `extra`.
 
     Args:
         path: the file, ``.npz``, which is written atomically; missing folders are created.
@@ -41,10 +41,11 @@ def save_pairs(path: str | os.PathLike[str], pairs: Eigenpairs, extra: Mapping[s
     """
     if not os.fspath(path).endswith(".npz"):
         raise ValueError(f"path: got {os.fspath(path)!r}; expected a name that ends in .npz")
-    arrays = {name: np.asarray(getattr(pairs, name)) for name in ARRAYS}
-    if len(pairs.problems) > 1:
-        arrays["part"] = np.asarray(pairs.problem_numbers)
-    content: dict[str, Any] = {**arrays, "solver_name": pairs.solver_name, **(extra or {})}
+    content: dict[str, Any] = {"eigenvalues": np.asarray(pairs.eigenvalues)}
+    for prefix, each in zip(_prefixes(len(pairs.problems)), pairs.problems, strict=True):
+        content |= {prefix + name: np.asarray(getattr(each, name)) for name in ARRAYS}
+        content[f"{prefix}solver_name"] = each.solver_name
+    content |= extra or {}
     write_npz(path, content, compressed=False)
     return Path(path)
 
@@ -73,31 +74,13 @@ def load_pairs(path: str | os.PathLike[str], pencil: AnyPencil) -> Eigenpairs:
 
 def pairs_of(name: str, arrays: Mapping[str, np.ndarray], pencil: AnyPencil) -> Eigenpairs:
     """Return the eigenpairs in the arrays of the file `name`; see `load_pairs`."""
-    doubled = isinstance(pencil, MirrorPencil)
-    names = [key for key in (*ARRAYS, *["part"] * doubled) if key != "rounding" or key in arrays]
-    missing = [key for key in (*names, "solver_name") if key not in arrays]
-    if missing:
-        raise ValueError(f"{name}: the file lacks {', '.join(missing)}; expected a file that save_pairs wrote")
-    if not arrays.get("lowest", True):  # earlier versions wrote such files
-        raise ValueError(f"{name}: got the eigenpairs of an interval; expected the lowest eigenpairs")
-    dtype = pencil.parts[0].stiffness.dtype
-    values: dict[str, Any] = {
-        key: jnp.asarray(a, dtype if a.dtype.kind == "f" else None) for key in names for a in [arrays[key]]
-    }
-    k, n = values["eigenvalues"].shape[-1], pencil.space.n_dof
-    if values["vectors"].shape != (k, n):
-        raise ValueError(
-            f"{name}: got eigenfunctions of shape {values['vectors'].shape}; expected {(k, n)} for this pencil. Use "
-            "the mask and the boundary with which the pairs were computed"
-        )
-    values.setdefault("rounding", jnp.zeros_like(values["eigenvalues"]))  # older files lack it
-    values["solver_name"] = str(np.asarray(arrays["solver_name"]))
-    pairs: Eigenpairs
+    parts = pencil.parts if isinstance(pencil, MirrorPencil) else (pencil,)
+    problems = [
+        _of_problem(name, arrays, prefix, part) for prefix, part in zip(_prefixes(len(parts)), parts, strict=True)
+    ]
+    pairs: Eigenpairs = problems[0]
     if isinstance(pencil, MirrorPencil):
-        problems = (_of_problem(values, pencil, number) for number in range(len(pencil.parts)))
-        pairs = doubled_pairs(list(problems), pencil.including, k)
-    else:
-        pairs = PencilEigenpairs(frame=values.pop("vectors"), pencil=pencil, **values)
+        pairs = doubled_pairs(problems, pencil.including, len(arrays["eigenvalues"]))
     gap = np.concatenate([_residuals(each) for each in pairs.problems])
     ends = np.array([pairs.next_eigenvalue, *pairs.eigenvalues[-1:], pairs.spectral_origin])
     size = np.max(np.abs(ends[np.isfinite(ends)]))
@@ -110,13 +93,34 @@ def pairs_of(name: str, arrays: Mapping[str, np.ndarray], pencil: AnyPencil) -> 
     return pairs
 
 
-def _of_problem(values: dict[str, Any], pencil: MirrorPencil, number: int) -> PencilEigenpairs:
-    """Return the pairs of one problem of a doubled domain, given the arrays of all its pairs."""
-    own, part = np.flatnonzero(values["part"] == number), pencil.parts[number]
-    # On the domain doubled m times, vectors have norm 1, hence norm 1/√2ᵐ on the domain itself.
-    frame = math.sqrt(len(pencil.parts)) * pencil.space.transfer(values["vectors"][own], part.space)
-    others = {key: x[own] if np.ndim(x) else x for key, x in values.items() if key not in ("vectors", "part")}
-    return PencilEigenpairs(frame=frame, pencil=part, **others)
+def _prefixes(problems: int) -> list[str]:
+    """Return what the names of each problem's arrays begin with: nothing if there is one problem."""
+    return [""] if problems == 1 else [f"problem_{number}_" for number in range(problems)]
+
+
+def _of_problem(name: str, arrays: Mapping[str, np.ndarray], prefix: str, pencil: Pencil) -> PencilEigenpairs:
+    """Return the pairs of one problem."""
+    names = [key for key in ARRAYS if key != "rounding" or prefix + key in arrays]
+    missing = [prefix + key for key in (*names, "solver_name") if prefix + key not in arrays]
+    if missing:
+        raise ValueError(
+            f"{name}: the file lacks {', '.join(missing)}; expected a file that save_pairs wrote for the same boundary"
+        )
+    if not arrays.get("lowest", True):  # earlier versions wrote such files
+        raise ValueError(f"{name}: got the eigenpairs of an interval; expected the lowest eigenpairs")
+    dtype = pencil.stiffness.dtype
+    values: dict[str, Any] = {
+        key: jnp.asarray(a, dtype if a.dtype.kind == "f" else None) for key in names for a in [arrays[prefix + key]]
+    }
+    k, n = values["eigenvalues"].shape[-1], pencil.space.n_dof
+    if values["vectors"].shape != (k, n):
+        raise ValueError(
+            f"{name}: got eigenfunctions of shape {values['vectors'].shape}; expected {(k, n)} for this pencil. Use "
+            "the mask and the boundary with which the pairs were computed"
+        )
+    values.setdefault("rounding", jnp.zeros_like(values["eigenvalues"]))  # older files lack it
+    solver = str(np.asarray(arrays[f"{prefix}solver_name"]))
+    return PencilEigenpairs(frame=values.pop("vectors"), pencil=pencil, solver_name=solver, **values)
 
 
 def _residuals(pairs: PencilEigenpairs) -> np.ndarray:
