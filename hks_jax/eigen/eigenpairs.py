@@ -356,13 +356,6 @@ class PencilEigenpairs(Eigenpairs, eqx.Module):
         """Return the values of the only problem."""
         return values[0]
 
-    def on(self, pencil: Pencil) -> "PencilEigenpairs":
-        """Return the pairs on another pencil that has the same nodes but other free nodes; see `on_all_nodes`."""
-        if pencil is self.pencil:
-            return self
-        frame = self.space.transfer(self.frame, pencil.space)
-        return eqx.tree_at(lambda p: (p.frame, p.pencil), self, (frame, pencil))
-
 
 @numpy_where_known()
 def _first_beyond(xp: Any, kept: Any, values: Any, following: Any) -> Any:

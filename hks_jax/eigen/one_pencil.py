@@ -14,7 +14,7 @@ from hks_jax.eigen.derivative import solved
 from hks_jax.eigen.eigenpairs import UNCERTAIN, PencilEigenpairs
 from hks_jax.eigen.quality import allowed_residuals, indistinct, largest, largest_of, measure_pairs, measured_on_host
 from hks_jax.eigen.solver import Dense, Eigensolver, Report
-from hks_jax.fem.nodal import on_all_nodes
+from hks_jax.fem.box import from_box, in_box
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import MatrixSpace
 from hks_jax.linear.host_matrices import balanced, near_zero
@@ -25,8 +25,7 @@ def pairs_of_pencil(
     pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw: bool, report: Report
 ) -> PencilEigenpairs:
     """Return the k lowest pairs and, if ``extra`` = 1, the next eigenvalue. See `solved` for ``throw``."""
-    # Iterative solvers compute on all nodes, so that all masks share compiled code.
-    given, pencil = pencil, pencil if isinstance(solver, Dense) else on_all_nodes(pencil, k + extra)
+    given, pencil = pencil, pencil if isinstance(solver, Dense) else in_box(pencil, k + extra)
     solver.require(pencil)
     pencil, n_dof, most = _with_balance(pencil), pencil.size, solver.max_pairs(pencil.size)
     if k + extra > most and pencil.null_space is None:
@@ -40,7 +39,8 @@ def pairs_of_pencil(
             f"k: got {k}, for which {k + extra} pairs are needed (one more shows where the spectrum is cut); the "
             f"{solver.name} solver computes at most {most} of {n_dof} pairs. Use a smaller k or the dense solver"
         )
-    return _pairs(pencil, solved(solver, pencil, k, extra, throw, report), solver).on(given)
+    pairs = _pairs(pencil, solved(solver, pencil, k, extra, throw, report), solver)
+    return replace(pairs, frame=from_box(pairs.frame, pencil.space, given.space), pencil=given)
 
 
 def _with_balance(pencil: Pencil) -> Pencil:

@@ -14,7 +14,6 @@ from hks_jax.checks import require_static
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.eigenpairs import Eigenpairs, PencilEigenpairs
 from hks_jax.eigen.rotations import changes_between
-from hks_jax.fem.nodal import on_all_nodes
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.linear_map import first_order_only, instantiated, is_constant
@@ -58,10 +57,9 @@ def spectral_flow(
     Under "mirror" and "mean" functions are reflected to the doubled domain, as the metric is. So they are even, and
     only the even problem matters.
     """
-    even = _on_all_nodes(pairs.problems[0])
-    known = pairs.space.transfer(pairs.space.restrict(functions), even.space)
-    flow = _kernel(Applied(even.pencil.integrals(known)), filters, even)
-    return nan_outside(even.space.extend(flow), pairs.space.domain)
+    even = pairs.problems[0]
+    flow = _kernel(Applied(even.pencil.integrals(even.space.restrict(functions))), filters, even)
+    return even.space.extend(flow)
 
 
 def spectral_trace(pairs: Eigenpairs, filters: Filter) -> Float[Array, " m"]:
@@ -73,13 +71,8 @@ def spectral_trace(pairs: Eigenpairs, filters: Filter) -> Float[Array, " m"]:
 # even function and odd ones, so the kernel between points of the original domain is the mean of the problems' kernels.
 def _mean(pairs: Eigenpairs, filters: Filter, contraction: Callable[[FunctionSpace], Contraction]) -> Array:
     """Return the mean over all problems of the contractions (…, *shape) of kernels; meaningless outside the mask."""
-    problems = [_on_all_nodes(each) for each in pairs.problems]
-    nodal = [_nodal(each.space, _kernel(contraction(each.space), filters, each)) for each in problems]
+    nodal = [_nodal(each.space, _kernel(contraction(each.space), filters, each)) for each in pairs.problems]
     return nodal[0] if len(nodal) == 1 else reduce(operator.add, nodal) / len(nodal)
-
-
-def _on_all_nodes(pairs: PencilEigenpairs) -> PencilEigenpairs:
-    return pairs.on(on_all_nodes(pairs.pencil))
 
 
 def _nodal(space: FunctionSpace, values: Float[Array, "*leading n"]) -> Float[Array, "*leading_and_shape"]:

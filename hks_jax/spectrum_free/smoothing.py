@@ -18,7 +18,7 @@ from hks_jax.domain.tensor_field import TensorField
 from hks_jax.eigen.solver import Report, Status, silent
 from hks_jax.fem.assembly import assemble
 from hks_jax.fem.boundary import BoundarySpec
-from hks_jax.fem.nodal import cropped
+from hks_jax.fem.box import cropped
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.resolution import mean_diffusivity
 from hks_jax.linear import accelerators

@@ -13,7 +13,8 @@ import hks_jax as hj
 from hks_jax.eigen.filter import chebyshev_filter
 from hks_jax.eigen.filter.coarsening import coarsen, interpolate
 from hks_jax.eigen.filter.polynomial import MOST_DEGREE, Band, correction, upper_end
-from hks_jax.fem.nodal import cropped, nodal_pencil, to_columns, to_rows
+from hks_jax.fem.box import cropped
+from hks_jax.fem.nodal import nodal_pencil, to_columns, to_rows
 
 
 def masked(shape):

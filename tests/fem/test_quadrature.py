@@ -181,8 +181,7 @@ MASK[:2, 2:] = False
 @pytest.mark.parametrize(
     "boundary", [*(pytest.param(b, marks=pytest.mark.slow) for b in ("neumann", "mean")), ("dirichlet", "periodic")]
 )
-def test_masks_give_the_same_on_all_nodes(rng, boundary):
-    # Signatures of concrete values work on all nodes of the grid; under `jit` nothing does.
+def test_signatures_on_a_mask_are_the_sums_of_squares(rng, boundary):
     mask = np.ones((7, 6), bool)
     mask[:2, 3:] = False
     field = hj.TensorField(hj.Grid((7, 6), mask=mask), random_spd(rng, (7, 6), 0.3))

@@ -22,7 +22,7 @@ from hks_jax.eigen.filter.subspace_iteration import FilterPlan, FilterState, Gri
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, Status, silent
 from hks_jax.fem.halo import checked_mesh
-from hks_jax.fem.nodal import NodalPencil, cropped, nodal_pencil
+from hks_jax.fem.nodal import NodalPencil, nodal_pencil
 from hks_jax.fem.pencil import Pencil, from_lower_bound
 from hks_jax.fem.space import GridSpace
 from hks_jax.fem.stencil import StencilOperator
@@ -94,7 +94,6 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         """Return the k lowest eigenpairs; the bound is NaN, because the method has no certificate."""
         moved, origin = from_lower_bound(pencil)
         assert isinstance(moved, Pencil)
-        moved = cropped(moved)
         assert isinstance(moved.space, GridSpace)
         plan = self.plan(k, moved.space)
         compute = _compiled if is_traced(moved) else _iterate

@@ -17,7 +17,7 @@ from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.adjoints import complement
 from hks_jax.eigen.adjoints.complement import Adjoint, Columns, Rows, Scalar, Values, Vectors
 from hks_jax.eigen.filter.polynomial import Band, correction, upper_end
-from hks_jax.fem.nodal import cropped, nodal_pencil, to_columns, to_rows
+from hks_jax.fem.nodal import nodal_pencil, to_columns, to_rows
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.stencil import StencilOperator
 from hks_jax.linear.conjugate_gradients import conjugate_gradients
@@ -54,13 +54,12 @@ class FilteredAdjoint(Adjoint[Pencil]):
         """Return an upper bound of the spectrum of D⁻¹K, where D is the lumped mass."""
         if not isinstance(pencil.stiffness, StencilOperator):
             raise ValueError("adjoint: got FilteredAdjoint, which needs a grid; use FactorisedAdjoint for a mesh")
-        return upper_end(nodal_pencil(cropped(pencil)))
+        return upper_end(nodal_pencil(pencil))
 
     @jit_quickly()
     def solve(self, prepared: Scalar, pencil: Pencil, values: Values, vectors: Vectors, rhs: Rows) -> Rows:
         """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`."""
-        pencil, high = cropped(pencil), prepared
-        space, nodal = pencil.space, nodal_pencil(pencil)
+        high, space, nodal = prepared, pencil.space, nodal_pencil(pencil)
         tolerance, beyond = complement.attainable(self.tolerance, rhs.dtype), complement.first_beyond(values)
         # The polynomial acts on D⁻¹K, where D is the lumped mass. On coarse grids, φᵀKφ / φᵀDφ is only a fraction of λ.
         mass = space.restrict(nodal.lumped)
