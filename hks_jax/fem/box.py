@@ -1,7 +1,6 @@
 """The pencil of a grid on the box around its domain, where similar masks share compiled code."""
 
 from dataclasses import replace
-from functools import lru_cache
 from typing import Any
 
 import jax
@@ -9,20 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hks_jax.domain.components import bounding_box
-from hks_jax.domain.grid import Grid
 from hks_jax.fem.pencil import Pencil
-from hks_jax.fem.space import FunctionSpace, GridSpace, grid_space
+from hks_jax.fem.space import FunctionSpace, GridSpace
 from hks_jax.fem.stencil import StencilOperator, coefficients_of
 from hks_jax.linear.operators import DiagonalOperator, Operator
 from hks_jax.linear.symmetric_pencil import NullSpace
 from hks_jax.traced import is_traced
 
-_ROUND = {2: 16, 3: 4}
-"""The sides of a box are multiples of this number of nodes, for each dimension, so that boxes of similar masks agree.
-In 3D, where additional nodes cost more time than compilation, the number is smaller."""
-_SAVED = 0.8
-"""A grid is cropped if the nodes that remain are at most this fraction."""
 _FILLED = {2: 0.45, 3: 0.6}
 """The least fraction of free nodes, for each dimension, at which `in_box` uses all nodes. With half of the nodes free
 in 2D, computations on all nodes take 1.4 to 1.9 times as long as on the free nodes, so that ten calls lose the time
@@ -37,7 +29,7 @@ def cropped(pencil: Pencil) -> Pencil:
     """
     if not isinstance(pencil.space, GridSpace):
         return pencil
-    box, space = _around(pencil.space)
+    box, space = pencil.space.around
     if space == pencil.space:
         return pencil
 
@@ -47,26 +39,6 @@ def cropped(pencil: Pencil) -> Pencil:
 
     parts = {"stiffness": part(pencil.stiffness), "mass": part(pencil.mass), "space": space}
     return replace(pencil, **parts, metric=None, density=None, source=None)
-
-
-@lru_cache(maxsize=32)
-def _around(space: GridSpace) -> tuple[tuple[slice, ...], GridSpace]:
-    """Return the slices of the box around the domain, and the space with the same unknowns on the nodes of the box."""
-    # With a margin of a node, a new end of an axis is no side of the domain.
-    whole, step = space.grid.inside, _ROUND[space.dimension]
-    around = zip(bounding_box(whole, margin=1), whole.shape, space.periodic, strict=True)
-    box = tuple(slice(None) if wraps else _rounded(part, n, step) for part, n, wraps in around)
-    inside = whole[box]
-    if inside.size > _SAVED * space.free.size:
-        return (slice(None),) * space.dimension, space
-    return box, grid_space(Grid(inside.shape, mask=inside, components="all"), space.boundary)
-
-
-def _rounded(part: slice, n: int, step: int) -> slice:
-    """Return a slice of n nodes that contains the given one, and whose length is a multiple of ``step`` if possible."""
-    size = min(-(-(part.stop - part.start) // step) * step, n)
-    first = min(part.start, n - size)
-    return slice(first, first + size)
 
 
 def in_box(pencil: Pencil, k: int) -> Pencil:
@@ -83,9 +55,7 @@ def in_box(pencil: Pencil, k: int) -> Pencil:
         return pencil
     if not _FILLED[space.dimension] * space.free.size <= space.n_dof < space.free.size:
         return pencil
-    natural = ("neumann", "neumann")
-    sides = [("periodic", "periodic") if wraps else natural for wraps in space.periodic]
-    whole = grid_space(Grid(space.node_shape), (*sides, natural))
+    whole = space.whole
     of_stiffness, of_mass = (coefficients_of(each, space) for each in (pencil.stiffness, pencil.mass))
     of_stiffness, of_mass = _with_others(of_stiffness, of_mass, space.free)
     diagonal = isinstance(pencil.mass, DiagonalOperator)
@@ -106,7 +76,7 @@ def from_box(vectors: Float[Array, "k n_box"], boxed: FunctionSpace, space: Func
     if boxed == space:
         return vectors
     assert isinstance(space, GridSpace)
-    return boxed.transfer(vectors, _around(space)[1])
+    return boxed.transfer(vectors, space.around[1])
 
 
 # The eigenvalue of the separate equations is the largest quotient Kᵢᵢ/Mᵢᵢ of the free nodes, a Rayleigh quotient, and

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.arrays import ByKey
 from hks_jax.compilation import numpy_where_known
-from hks_jax.domain.components import active_elements, element_nodes, label_nodes, rim_nodes, wrap_nodes
+from hks_jax.domain.components import active_elements, bounding_box, element_nodes, label_nodes, rim_nodes, wrap_nodes
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.triangulation import Triangulation
 from hks_jax.fem.boundary import Sides
@@ -22,6 +22,11 @@ from hks_jax.traced import is_staged, is_traced
 
 _COPIED = 1 << 22
 """The largest number of values that NumPy copies in less time than a compilation takes."""
+_ROUND = {2: 16, 3: 4}
+"""The sides of a box are multiples of this number of nodes, for each dimension, so that boxes of similar masks agree.
+In 3D, where additional nodes cost more time than compilation, the number is smaller."""
+_SAVED = 0.8
+"""A grid is cropped if the nodes that remain are at most this fraction."""
 
 
 class FunctionSpace(ByKey):
@@ -158,6 +163,36 @@ class GridSpace(FunctionSpace):
     def cells(self) -> Int[np.ndarray, "E n"]:
         """The nodes of each element of the domain."""
         return cells_of(self.elements, self.node_shape, self.periodic)
+
+    @property
+    def whole(self) -> "GridSpace":
+        """The space of all nodes of the grid, with the same periodic axes and otherwise natural sides."""
+        natural = ("neumann", "neumann")
+        sides = [("periodic", "periodic") if wraps else natural for wraps in self.periodic]
+        return grid_space(Grid(self.node_shape), (*sides, natural))
+
+    @cached_property
+    def around(self) -> tuple[tuple[slice, ...], "GridSpace"]:
+        """The slices of the box around the domain, and the space with the same unknowns on the nodes of the box.
+
+        Along periodic axes the box has all nodes. If the box would have hardly fewer nodes than the grid, it is the
+        grid.
+        """
+        # With a margin of a node, a new end of an axis is no side of the domain.
+        whole, step = self.grid.inside, _ROUND[self.dimension]
+        ends = zip(bounding_box(whole, margin=1), whole.shape, self.periodic, strict=True)
+        box = tuple(slice(None) if wraps else _rounded(part, n, step) for part, n, wraps in ends)
+        inside = whole[box]
+        if inside.size > _SAVED * whole.size:
+            return (slice(None),) * self.dimension, self
+        return box, grid_space(Grid(inside.shape, mask=inside, components="all"), self.boundary)
+
+
+def _rounded(part: slice, n: int, step: int) -> slice:
+    """Return a slice of n nodes that contains the given one, and whose length is a multiple of ``step`` if possible."""
+    size = min(-(-(part.stop - part.start) // step) * step, n)
+    first = min(part.start, n - size)
+    return slice(first, first + size)
 
 
 def cells_of(
