@@ -34,8 +34,8 @@ from hks_jax.domain.simplices import WORDS, signed_measure
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_checks import MANY, unsymmetric
 from hks_jax.fem.boundary import BoundarySpec, default_boundary
-from hks_jax.io import TensorVolume, find_invalid, read_mesh
-from hks_jax.io.mesh import arrays_by_place, is_mesh
+from hks_jax.io import TensorVolume, find_invalid
+from hks_jax.io.mesh import is_mesh, load_mesh
 from hks_jax.io.repair import least_admissible
 from hks_jax.io.result import NAMES, Result, signature_file
 from hks_jax.io.units import MEDIAN, MM2_PER_S, by_axis, is_plausible, unit_of_times
@@ -62,8 +62,8 @@ def run(args: argparse.Namespace, progress: Progress) -> None:
     if result is not None:
         description = _describe_result(result)
     elif is_mesh(args.file):
-        description = {"file": str(args.file), **describe_mesh(args.file, read_mesh(args.file, clean=args.clean))}
-        description["arrays"] = listed(arrays_by_place(args.file, args.clean))
+        found = load_mesh(args.file, args.clean)
+        description = {"file": str(args.file), **describe_mesh(args.file, found.mesh), "arrays": listed(found.arrays)}
     else:
         description = {
             **describe(args.file, read(Reading.of(args), progress, questions.append)),

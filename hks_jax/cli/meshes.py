@@ -17,9 +17,9 @@ from hks_jax.cli.options import add_reading, defaults, refuse
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import Reading, read, require_one
 from hks_jax.fem.assembly import MESH_BOUNDARIES
-from hks_jax.io import TensorVolume, read_mask, read_mesh, sample_tensors
-from hks_jax.io.cortex import MAPS, structure_of
-from hks_jax.io.mesh import WRITTEN, arrays_by_place, is_surface
+from hks_jax.io import TensorVolume, read_mask, sample_tensors
+from hks_jax.io.cortex import MAPS, STRUCTURE
+from hks_jax.io.mesh import WRITTEN, MeshInFile, is_surface, load_mesh
 from hks_jax.io.repair import require_valid
 from hks_jax.io.sampling import OutsideMaskError
 from hks_jax.io.tensor_order import Order, matrices
@@ -71,15 +71,17 @@ def require_mesh_options(args: argparse.Namespace) -> None:
     require_one(args.metric, args.operator)
 
 
-def _images(file: Path, mesh: Mesh, clean: bool) -> tuple[tuple[str, ...], dict[str, str]]:
+def _images(file: Path, found: MeshInFile, clean: bool) -> tuple[tuple[str, ...], dict[str, str]]:
     """Return the suffixes of results on a mesh, and entries for their provenance.
 
     The suffixes are that of the mesh's file, or .vtu if its format has no values at vertices; and for a GIFTI or a
     FreeSurfer surface also that of GIFTI's maps, unless the vertices may have been renumbered by cleaning.
     """
     suffix = file.suffix.lower()
-    own = ".vtu" if suffix not in WRITTEN or (suffix == ".ply" and isinstance(mesh, TetMesh)) else suffix
-    return ((own, MAPS), structure_of(file)) if is_surface(file) and not clean else ((own,), {})
+    own = ".vtu" if suffix not in WRITTEN or (suffix == ".ply" and isinstance(found.mesh, TetMesh)) else suffix
+    if clean or not is_surface(file):
+        return (own,), {}
+    return (own, MAPS), {STRUCTURE: found.structure} if found.structure else {}
 
 
 def read_domain(mesh_file: MeshFile, settings: Settings, progress: Progress) -> OfMesh:
@@ -97,7 +99,8 @@ def read_domain(mesh_file: MeshFile, settings: Settings, progress: Progress) -> 
 
 def _with_metric(mesh_file: MeshFile, volume: TensorVolume | None, settings: Settings, progress: Progress) -> OfMesh:
     file, dtype = mesh_file.file, settings.dtype
-    mesh = read_mesh(file, clean=mesh_file.clean, in_space=volume is not None)
+    found = load_mesh(file, mesh_file.clean, in_space=volume is not None)
+    mesh = found.mesh
     vertices, cells = np.asarray(mesh.vertices).astype(dtype), mesh.triangulation.cells
     kind: Any = type(mesh)
     mask = None if mesh_file.inside is None else _inside(mesh_file.inside, len(vertices))
@@ -113,7 +116,7 @@ def _with_metric(mesh_file: MeshFile, volume: TensorVolume | None, settings: Set
         return with_metric
 
     def made(mesh: Mesh, *tensors: Any) -> OfMesh:
-        images, origin = _images(file, mesh, mesh_file.clean)
+        images, origin = _images(file, found, mesh_file.clean)
         return Domain(mesh, mesh, {"source": str(file), **describe_mesh(file, mesh)}, images, origin, *tensors)
 
     if volume is not None:
@@ -132,11 +135,10 @@ def _with_metric(mesh_file: MeshFile, volume: TensorVolume | None, settings: Set
             return of_tensors(tensors)
 
         return made(sampled(volume.tensors), volume.tensors, sampled, volume)
-    arrays = arrays_by_place(file, mesh_file.clean)
     if mesh_file.array is None:
-        _tell_of_tensors(arrays, progress)
+        _tell_of_tensors(found.arrays, progress)
         return made(kind(vertices, cells, mask=mask))
-    tensors, place = _tensors_in(arrays, mesh_file.array, mesh_file.order, progress)
+    tensors, place = _tensors_in(found.arrays, mesh_file.array, mesh_file.order, progress)
     return made(of_tensors(tensors.astype(dtype), place), tensors.astype(dtype), partial(of_tensors, at=place))
 
 

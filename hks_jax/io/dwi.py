@@ -19,7 +19,7 @@ from hks_jax.io.units import MM2_PER_S, UNITS, Unit, b_value_question, median_me
 from hks_jax.io.volume import TensorVolume, digest, placed
 from hks_jax.naming import argument
 from hks_jax.optional import optional
-from hks_jax.storage import existing, reading
+from hks_jax.storage import reading
 
 _LENGTH = 0.05
 """The largest difference of a direction's length from 1 that is attributed to rounding."""
@@ -424,8 +424,7 @@ def _inside(
 
 
 def _numbers(path: str | os.PathLike[str], *, may_be_nan: bool = False) -> Float[np.ndarray, "..."]:
-    file = existing(path)
-    with reading(file, "a table of numbers"), warnings.catch_warnings():
+    with reading(path, "a table of numbers") as file, warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # NumPy warns if a table is empty
         numbers = np.loadtxt(file, dtype=np.float64, encoding="utf-8-sig")
         if not numbers.size or not (may_be_nan or np.isfinite(numbers).all()):
