@@ -34,9 +34,9 @@ from hks_jax.domain.simplices import WORDS, signed_measure
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_checks import MANY, unsymmetric
 from hks_jax.fem.boundary import BoundarySpec, default_boundary
-from hks_jax.io import TensorVolume, find_invalid
+from hks_jax.io import TensorVolume
 from hks_jax.io.mesh import is_mesh, load_mesh
-from hks_jax.io.repair import least_admissible
+from hks_jax.io.repair import invalid_in
 from hks_jax.io.result import NAMES, Result, signature_file
 from hks_jax.io.units import MEDIAN, MM2_PER_S, by_axis, is_plausible, unit_of_times
 from hks_jax.io.volume import digest
@@ -108,8 +108,8 @@ def _shares(result: Result) -> str:
 
 def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = None) -> dict[str, Any]:
     """Return facts about a volume for JSON. If `boundary` is None, `default_boundary` determines suitable k and t."""
-    inside, bad = volume.inside, find_invalid(volume)
-    not_positive = int(find_invalid(volume, 0.0).sum())
+    inside, found = volume.inside, invalid_in(volume)
+    bad = found.bad
     boundary = default_boundary(inside)[0] if boundary is None else boundary
     good = inside & ~bad
     labels, count = label_nodes(inside, (False,) * volume.dimension)
@@ -127,9 +127,9 @@ def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = N
         "without_element": int(without_element(volume).sum()),
         "boundary": boundary,
         "component_sizes": np.sort(np.bincount(labels.ravel())[1:])[::-1][:10].tolist(),
-        "not_positive_definite": not_positive,
-        "nearly_singular": int(bad.sum()) - not_positive,
-        "least_admissible_eigenvalue": least_admissible(volume),
+        "not_positive_definite": int((bad & ~found.singular).sum()),
+        "nearly_singular": int(found.singular.sum()),
+        "least_admissible_eigenvalue": found.floor,
         "not_symmetric": int((inside & unsymmetric(volume.tensors)).sum()),
     }
     wrong = volume.invalid_by_order

@@ -1,6 +1,7 @@
 """Read a mesh, with the metric that tensors give it, from the options of meshes."""
 
 import argparse
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -10,16 +11,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
-from hks_jax import TetMesh
 from hks_jax.cli.computation import Domain, Mesh, OfMesh, Settings, use_dtype
-from hks_jax.cli.info import describe_mesh, listed
+from hks_jax.cli.info import describe_mesh
 from hks_jax.cli.options import add_reading, defaults, refuse
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import Reading, read, require_one
 from hks_jax.fem.assembly import MESH_BOUNDARIES
 from hks_jax.io import TensorVolume, read_mask, sample_tensors
-from hks_jax.io.cortex import MAPS, STRUCTURE
-from hks_jax.io.mesh import WRITTEN, MeshInFile, is_surface, load_mesh
+from hks_jax.io.mesh import load_mesh
 from hks_jax.io.repair import require_valid
 from hks_jax.io.sampling import OutsideMaskError
 from hks_jax.io.tensor_order import Order, matrices
@@ -71,19 +70,6 @@ def require_mesh_options(args: argparse.Namespace) -> None:
     require_one(args.metric, args.operator)
 
 
-def _images(file: Path, found: MeshInFile, clean: bool) -> tuple[tuple[str, ...], dict[str, str]]:
-    """Return the suffixes of results on a mesh, and entries for their provenance.
-
-    The suffixes are that of the mesh's file, or .vtu if its format has no values at vertices; and for a GIFTI or a
-    FreeSurfer surface also that of GIFTI's maps, unless the vertices may have been renumbered by cleaning.
-    """
-    suffix = file.suffix.lower()
-    own = ".vtu" if suffix not in WRITTEN or (suffix == ".ply" and isinstance(found.mesh, TetMesh)) else suffix
-    if clean or not is_surface(file):
-        return (own,), {}
-    return (own, MAPS), {STRUCTURE: found.structure} if found.structure else {}
-
-
 def read_domain(mesh_file: MeshFile, settings: Settings, progress: Progress) -> OfMesh:
     """Read a mesh in the chosen precision, with the metric of tensors in a volume or in an array of its file, if any.
 
@@ -116,8 +102,8 @@ def _with_metric(mesh_file: MeshFile, volume: TensorVolume | None, settings: Set
         return with_metric
 
     def made(mesh: Mesh, *tensors: Any) -> OfMesh:
-        images, origin = _images(file, found, mesh_file.clean)
-        return Domain(mesh, mesh, {"source": str(file), **describe_mesh(file, mesh)}, images, origin, *tensors)
+        about = {"source": str(file), **describe_mesh(file, mesh)}
+        return Domain(mesh, mesh, about, found.written, found.origin, *tensors)
 
     if volume is not None:
         at = np.arange(len(vertices)) if mask is None else np.flatnonzero(mask)
@@ -144,13 +130,14 @@ def _with_metric(mesh_file: MeshFile, volume: TensorVolume | None, settings: Set
 
 def _tell_of_tensors(arrays: Mapping[str, Mapping[str, np.ndarray]], progress: Progress) -> None:
     """Print a note about arrays that may be tensors."""
-    for each in (each for each in listed(arrays) if each["components"] in (6, 9)):
-        progress.note(
-            f"the {each['components']} components of {each['name']} at the {each['at']} are not used, and the mesh "
-            f"has the Euclidean metric. To use them, pass --array {each['name']}"
-            + " and --order"
-            * (each["components"] == 6)
-        )
+    for at, named in arrays.items():
+        for name, values in named.items():
+            components = math.prod(values.shape[1:])
+            if components in (6, 9):
+                progress.note(
+                    f"the {components} components of {name} at the {at} are not used, and the mesh has the Euclidean "
+                    f"metric. To use them, pass --array {name}" + " and --order" * (components == 6)
+                )
 
 
 def _tensors_in(

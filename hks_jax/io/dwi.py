@@ -129,7 +129,7 @@ def fit_dwi(
         [0.001 0.001 0.001]
     """
     name, table = os.fspath(path), f"{os.fspath(bval)}, {os.fspath(bvec)}"
-    image = nifti.load(name)
+    image, voxels = nifti.load(name)
     affine, _ = nifti.affine_in_mm(name, image)
     b, directions = np.atleast_1d(_numbers(bval).squeeze()), np.atleast_2d(_numbers(bvec, may_be_nan=True))
     if directions.shape[-1] != 3 or directions.shape == (3, 3) != (b.size, 3):
@@ -158,7 +158,7 @@ def fit_dwi(
             f"unknowns; expected at least {_UNKNOWNS + 1} images, and 15 for an estimate with an error of 25 %. Give "
             "the standard deviation of the noise as a number"
         )
-    signal = nifti.voxels(name, image)[..., used]
+    signal = voxels[..., used]
     inside, found = _inside(name, mask, signal, design, b, images, _UNKNOWNS + (noise == "residuals"), affine)
     data = signal[inside].astype(np.float64)
     tensors, pieces = np.zeros((*inside.shape, 3, 3)), []

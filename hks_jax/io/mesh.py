@@ -5,7 +5,7 @@ import os
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -21,9 +21,10 @@ from hks_jax.io import cortex
 from hks_jax.io.mesh_formats import Loaded, load_obj, load_off, polygonal, through_meshio
 from hks_jax.io.ply import load_ply
 from hks_jax.io.tables import write_json
+from hks_jax.io.vtk_image import by_time
 from hks_jax.naming import argument
 from hks_jax.optional import optional
-from hks_jax.storage import UnsuitedError, atomic_path, reading
+from hks_jax.storage import UnsuitedError, atomic_path, reading, write_npz
 
 READ = (".vtk", ".vtu", ".vtp", ".msh", ".ply", ".stl", ".obj", ".off", ".gii", ".gii.gz")
 """The suffixes of meshes. FreeSurfer's surfaces have no suffix and are recognised by their first bytes."""
@@ -79,7 +80,8 @@ class MeshInFile(NamedTuple):
 
     mesh: SurfaceMesh | TetMesh
     arrays: dict[str, dict[str, Float[np.ndarray, "n *components"]]]
-    structure: str  # of a brain's surface, in the terms of GIFTI, such as CortexLeft; empty if it is not known
+    written: tuple[str, ...]  # the suffixes of results on the mesh
+    origin: dict[str, str]  # entries of their provenance
 
 
 def load_mesh(path: str | os.PathLike[str], clean: bool = False, in_space: bool = False) -> MeshInFile:
@@ -95,7 +97,12 @@ def load_mesh(path: str | os.PathLike[str], clean: bool = False, in_space: bool 
         raise ValueError(f"{os.fspath(path)}: {error}{remedy}") from error
     if said:
         warn_of_accuracy(f"{os.fspath(path)}: {said}{remedy}", UserWarning if clean else AccuracyWarning)
-    return MeshInFile(mesh, _by_place(loaded), loaded.structure)
+    suffix = Path(path).suffix.lower()
+    if suffix not in WRITTEN or (suffix == ".ply" and isinstance(mesh, TetMesh)):
+        suffix = ".vtu"  # the file's format has no values at vertices
+    maps = is_surface(Path(path)) and not clean  # cleaning may have renumbered the vertices
+    origin = {cortex.STRUCTURE: loaded.structure} if maps and loaded.structure else {}
+    return MeshInFile(mesh, _by_place(loaded), (suffix, cortex.MAPS) if maps else (suffix,), origin)
 
 
 def read_mesh_arrays(
@@ -173,19 +180,25 @@ def _head(path: Path) -> bytes:
     return head if head.startswith((cortex.TRIANGLES, b"# vtk DataFile")) else b""
 
 
-def write(path: Path, arrays: Mapping[str, Float[np.ndarray, " V"]], mesh: SimplicialMesh, record: str = "") -> None:
+def write(
+    path: Path, array: Float[np.ndarray, "*n V"], mesh: SimplicialMesh, name: str, extra: Mapping[str, Any], record: str
+) -> None:
     """Write a mesh with values at its vertices, and a record of their origin, if any, to the file ``path.json``.
 
-    A GIFTI file has the values and the record, and no mesh.
+    An npz file also has the arrays in `extra`. A GIFTI file has the values and no mesh. Both have the record.
     """
-    suffix, solid = path.suffix.lower(), mesh.triangulation.dimension == 3
+    suffix, dimension = path.suffix.lower(), mesh.triangulation.dimension
+    if suffix == ".npz":
+        place = {"vertices": np.asarray(mesh.vertices), WORDS[dimension].argument: mesh.triangulation.cells}
+        return write_npz(path, {name: array, **place, **extra, "provenance": record})
+    arrays, solid = by_time(name, array, array.ndim - 1, extra), dimension == 3
     if suffix == ".gii" and not solid:
         return cortex.write_maps(path, arrays, record)
     allowed = [s for s in (*WRITTEN, ".gii") if not (solid and s in (".ply", ".gii"))]
     if suffix not in allowed:
         what = "values at the vertices of tetrahedra" if solid else "values at vertices"
         raise ValueError(f"path: got {str(path)!r}; {what} can be written as {', '.join(allowed)} or .npz")
-    if reserved := [name for name in arrays if name in _RESERVED.get(suffix, ())]:
+    if reserved := [key for key in arrays if key in _RESERVED.get(suffix, ())]:
         raise ValueError(f"name: got {reserved[0]!r}, which has another meaning in {suffix}; choose another name")
     library = optional("meshio")
     cells = [("tetra" if solid else "triangle", mesh.triangulation.cells.astype(np.int32))]  # PLY has no int64

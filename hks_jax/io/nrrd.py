@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from hks_jax.io.repair import require_symmetric
-from hks_jax.io.tensor_order import matrices, nearest_rotation, pack, to_voxel_axes
+from hks_jax.io.tensor_order import matrices, nearest_rotation, pack, shear_notes, to_voxel_axes
 from hks_jax.io.units import millimetres
-from hks_jax.io.volume import Format, TensorVolume, describe_tensors, images_of, own_record, shear_notes
+from hks_jax.io.volume import Format, TensorVolume, describe_tensors, images_of, own_record
 from hks_jax.naming import argument
 from hks_jax.optional import optional
 from hks_jax.storage import atomic_path, reading
