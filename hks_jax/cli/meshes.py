@@ -5,24 +5,29 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool
+from scipy.spatial import cKDTree
 
 from hks_jax.cli.computation import Domain, Mesh, OfMesh, Settings, use_dtype
-from hks_jax.cli.info import describe_mesh
 from hks_jax.cli.options import add_reading, defaults, refuse
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import Reading, read, require_one
+from hks_jax.domain.simplices import WORDS, signed_measure
+from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.fem.assembly import MESH_BOUNDARIES
 from hks_jax.io import TensorVolume, read_mask, sample_tensors
 from hks_jax.io.mesh import load_mesh
 from hks_jax.io.repair import require_valid
 from hks_jax.io.sampling import OutsideMaskError
 from hks_jax.io.tensor_order import Order, matrices
+from hks_jax.io.volume import digest
 from hks_jax.optional import optional
+from hks_jax.signatures.times import suitable_times
 
 OF_TENSORS = ("metric", "operator", "order", "interpolation")
 """Options that refer to tensors of a mesh."""
@@ -126,6 +131,28 @@ def _with_metric(mesh_file: MeshFile, volume: TensorVolume | None, settings: Set
         return made(kind(vertices, cells, mask=mask))
     tensors, place = _tensors_in(found.arrays, mesh_file.array, mesh_file.order, progress)
     return made(of_tensors(tensors.astype(dtype), place), tensors.astype(dtype), partial(of_tensors, at=place))
+
+
+def describe_mesh(path: Path, mesh: SimplicialMesh) -> dict[str, Any]:
+    """Return facts about a mesh in space for JSON."""
+    vertices, cells, d = np.asarray(mesh.vertices, np.float64), mesh.triangulation.cells, mesh.triangulation.dimension
+    measure = float(np.sum(signed_measure(vertices, cells)[0])) / math.factorial(d)
+    sides = [vertices[cells[:, i]] - vertices[cells[:, j]] for i, j in combinations(range(d + 1), 2)]
+    edge = float(np.median(np.linalg.norm(np.concatenate(sides), axis=1)))
+    size, rim = float(np.linalg.norm(np.ptp(vertices, axis=0))), mesh.triangulation.boundary_vertices
+    used = mesh.triangulation.used
+    depth = float(np.median(cKDTree(vertices[rim]).query(vertices[used])[0])) if rim.any() else math.inf
+    return {
+        "sha256": digest(path),
+        "format": path.suffix,
+        "vertices": len(vertices),
+        WORDS[d].simplices: len(cells),
+        "boundary_vertices": int(rim.sum()),
+        "components": mesh.triangulation.labels[1],
+        WORDS[d].measure: measure,
+        "median_edge": edge,
+        "suits": {{2: "surface", 3: "solid"}[d]: suitable_times(d, measure, edge**2, size, len(vertices), depth=depth)},
+    }
 
 
 def _tell_of_tensors(arrays: Mapping[str, Mapping[str, np.ndarray]], progress: Progress) -> None:

@@ -181,51 +181,36 @@ def save(
     if n not in (0, 1) or array.shape[n:] != shape:
         raise ValueError(f"values: got shape {array.shape}; expected {shape}, or (n_times, *shape)")
     record = describe(None if isinstance(volume, SimplicialMesh) else volume, provenance)
-    if file.suffix.lower() == ".pvd":
-        _save_series(file, array, volume, name, np.ravel((extra or {}).get("times", ())), record)
+    parts: list[tuple[Path, np.ndarray, dict[str, Any], str]]
+    series, times = file.suffix.lower() == ".pvd", np.ravel((extra or {}).get("times", ()))
+    if series:
+        if n != 1 or len(times) != len(array):
+            raise ValueError(
+                f"extra: got {len(times)} times for values of shape {array.shape}; expected values (n_times, *shape) "
+                'and extra={"times": …} with n_times numbers, as a time series has'
+            )
+        suffix, of_part = (".vtu", "") if isinstance(volume, SimplicialMesh) else (".vti", record)
+        parts = [(file.with_name(f"{file.stem}.{i}{suffix}"), each, {}, of_part) for i, each in enumerate(array)]
     else:
-        _write(file, array, volume, name, dict(extra or {}), record)
+        parts = [(file, array, dict(extra or {}), record)]
+    for part, of_array, more, about in parts:
+        if isinstance(volume, SimplicialMesh):
+            mesh.write(part, of_array, volume, name, more, about)
+        else:
+            write = format_of(part, WRITTEN).write
+            assert write is not None
+            write(part, of_array, volume, name, more, about)
+    if series:
+        _write_collection(file, times, [part.name for part, *_ in parts], record)
     return file
 
 
-def _write(
-    file: Path,
-    array: np.ndarray,
-    place: TensorVolume | SimplicialMesh,
-    name: str,
-    extra: dict[str, Any],
-    record: str,
-) -> None:
-    """Write values and a record of their origin in the format of the file's suffix."""
-    if isinstance(place, SimplicialMesh):
-        mesh.write(file, array, place, name, extra, record)
-    else:
-        write = format_of(file, WRITTEN).write
-        assert write is not None
-        write(file, array, place, name, extra, record)
-
-
-def _save_series(
-    path: Path,
-    array: np.ndarray,
-    place: TensorVolume | SimplicialMesh,
-    name: str,
-    times: Float[np.ndarray, " n_times"],
-    record: str,
-) -> None:
-    """Write one VTK file for each time, and the collection of them."""
-    of_mesh = isinstance(place, SimplicialMesh)
-    if array.ndim != 1 + (1 if isinstance(place, SimplicialMesh) else place.dimension) or len(times) != len(array):
-        raise ValueError(
-            f"extra: got {len(times)} times for values of shape {array.shape}; expected values (n_times, *shape) and "
-            'extra={"times": …} with n_times numbers, as a time series has'
-        )
+def _write_collection(path: Path, times: Float[np.ndarray, " n_times"], parts: Sequence[str], record: str) -> None:
+    """Write the list of the files of a time series, and a record of their origin."""
     collection = ElementTree.Element("VTKFile", type="Collection", version="0.1")
     entries = ElementTree.SubElement(collection, "Collection")
-    for i, (time, values) in enumerate(zip(times.tolist(), array, strict=True)):
-        part = path.with_name(f"{path.stem}.{i}{'.vtu' if of_mesh else '.vti'}")
-        _write(part, values, place, name, {}, "" if of_mesh else record)
-        ElementTree.SubElement(entries, "DataSet", timestep=repr(time), part="0", file=part.name)
+    for time, part in zip(times.tolist(), parts, strict=True):
+        ElementTree.SubElement(entries, "DataSet", timestep=repr(time), part="0", file=part)
     with atomic_path(path) as temporary:
         ElementTree.ElementTree(collection).write(temporary, encoding="utf-8", xml_declaration=True)
     write_json(path.with_name(f"{path.name}.json"), json.loads(record))

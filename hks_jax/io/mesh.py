@@ -87,6 +87,7 @@ class MeshInFile(NamedTuple):
 def load_mesh(path: str | os.PathLike[str], clean: bool = False, in_space: bool = False) -> MeshInFile:
     """Read a mesh and its arrays; see `read_mesh`."""
     loaded, said = _load(path, clean, in_space)
+    maps = is_surface(Path(path)) and not clean  # cleaning may have renumbered the vertices
     make: Callable[..., SurfaceMesh | TetMesh] = SurfaceMesh if loaded.cells.shape[1] == 3 else TetMesh
     remedy = "" if clean else f". {argument('clean', True)} repairs some defects"
     try:
@@ -100,7 +101,6 @@ def load_mesh(path: str | os.PathLike[str], clean: bool = False, in_space: bool 
     suffix = Path(path).suffix.lower()
     if suffix not in WRITTEN or (suffix == ".ply" and isinstance(mesh, TetMesh)):
         suffix = ".vtu"  # the file's format has no values at vertices
-    maps = is_surface(Path(path)) and not clean  # cleaning may have renumbered the vertices
     origin = {cortex.STRUCTURE: loaded.structure} if maps and loaded.structure else {}
     return MeshInFile(mesh, _by_place(loaded), (suffix, cortex.MAPS) if maps else (suffix,), origin)
 

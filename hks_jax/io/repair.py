@@ -137,7 +137,8 @@ def require_valid(volume: TensorVolume, argument: str = "repair") -> None:
             )
         if count > MANY * volume.inside.sum():
             remedy = f"{_why_so_many(volume, found)}. If only a few tensors are invalid, c{remedy[1:]}"
-        refuse_tensors("tensors", found.bad, volume.inside, "voxel", describe_invalid(volume, found), remedy)
+        what = describe_invalid(volume, found)
+        refuse_tensors("tensors", found.bad, volume.inside, "voxel", what, remedy)
 
 
 def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = None) -> TensorVolume:

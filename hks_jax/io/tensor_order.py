@@ -138,7 +138,8 @@ def invalid_by_order(components: Float[np.ndarray, "*shape n"], order: str) -> I
     rows = rows[np.any(rows != 0, axis=-1)]
 
     def invalid(some: np.ndarray, order: str) -> Bool[np.ndarray, " n"]:
-        return ~spd.is_spd(unpack(some, order))
+        tensors = unpack(some, order)
+        return ~spd.is_spd(tensors)
 
     if not len(rows) or np.mean(invalid(rows[:: max(1, len(rows) // _SAMPLE)], order)) <= MANY:
         return None
