@@ -45,4 +45,5 @@ def read_source(args: argparse.Namespace, progress: Progress, boundary: Boundary
         saved = saved_pairs.read_pairs(args.file, settings, progress)
         return Source(saved.domain, saved.settings, saved)
     volume = read_volume(Reading.of(args), progress)
-    return Source(domain_of_volume(volume, settings, format_of(args.file).image), settings)
+    image = format_of(args.file).image
+    return Source(domain_of_volume(volume, settings, image), settings)

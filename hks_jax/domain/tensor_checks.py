@@ -185,7 +185,7 @@ NUMBERS = {"exp": "scale", "shift": "shift"}
 
 def positive_map(
     name: str,
-    tensors: Float[Array, "*shape d d"],
+    tensors: Any,
     how: PositiveMap | None,
     number: Any,
     inside: Bool[np.ndarray, "*shape"],
@@ -202,6 +202,7 @@ def positive_map(
     if number is None:
         raise ValueError(f"number: got None; how={how!r} requires the {NUMBERS[how]}, in the units of {name}")
     require_number("number", number, above=0.0 if how == "exp" else -math.inf)
+    tensors = real_array(name, tensors)
     known = not is_traced((tensors, number))
     if known:
         require_finite_symmetric(name, np.asarray(tensors), inside, place)

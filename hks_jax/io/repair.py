@@ -10,7 +10,7 @@ from jaxtyping import Bool
 from scipy import ndimage
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.checks import real_array, require_number
+from hks_jax.checks import require_number
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_checks import (
     MANY,
@@ -320,8 +320,7 @@ def positive_tensors(volume: TensorVolume, how: PositiveMap, number: float) -> T
         [2.718 0.368]
     """
     inside, before = volume.inside, int(find_invalid(volume).sum())
-    given = real_array("tensors", volume.tensors)
-    mapped = np.asarray(positive_map("tensors", given, how, number, inside, "voxel"))
+    mapped = np.asarray(positive_map("tensors", volume.tensors, how, number, inside, "voxel"))
     tensors = np.where(inside[..., None, None], mapped, volume.tensors)
     formula = f"exp(S/{number:g})" if how == "exp" else f"S + {number:g}·I"
     note = f"{formula} of all tensors S; {before} of {int(inside.sum())} tensors were not positive definite"
