@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from hks_jax.domain.grid import per_axis
 from hks_jax.io.tensor_order import Matrices, matrices, to_voxel_axes
 from hks_jax.io.volume import Format, TensorVolume, describe_tensors, mask_in_file
 from hks_jax.storage import load_npy, load_npz, write_npz
@@ -60,10 +61,11 @@ def _read_tensors(
 def volume_of(name: str, arrays: Mapping[str, Any], tensors: Float[np.ndarray, "..."], **about: Any) -> TensorVolume:
     """Return a volume of `tensors` with the arrays of `place_of`; by default, spacing is 1 and origin is 0."""
     mask, affine, axis = (arrays.get(name) for name in ("mask", "affine", "slice_axis"))
+    d = tensors.shape[-1] if tensors.ndim else 0
     return TensorVolume(
         tensors,
-        arrays.get("spacing", 1.0),
-        arrays.get("origin", 0.0),
+        per_axis(f"{name}: spacing", arrays.get("spacing", 1.0), d),
+        per_axis(f"{name}: origin", arrays.get("origin", 0.0), d),
         None if mask is None else mask_in_file(f"{name}: mask", mask),
         None if affine is None else _real(f"{name}: affine", affine),
         None if axis is None else np.asarray(axis).tolist(),
