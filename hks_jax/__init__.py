@@ -49,6 +49,7 @@ from hks_jax.eigen.solver import Dense as Dense
 from hks_jax.eigen.solver import Eigensolver as Eigensolver
 from hks_jax.eigen.weyl import weyl_count as weyl_count
 from hks_jax.fem.assembly import assemble as assemble
+from hks_jax.fem.assembly import assemble_forms as assemble_forms
 from hks_jax.fem.boundary import crop as crop
 from hks_jax.fem.boundary import default_boundary as default_boundary
 from hks_jax.fem.boundary import reflect as reflect

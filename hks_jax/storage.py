@@ -85,6 +85,12 @@ def atomic_folder(path: str | os.PathLike[str], stale: Callable[[], Iterable[Pat
                     folder.rmdir()
 
 
+def content_of(path: Path) -> bytes:
+    """Return the bytes of a file, decompressed if they begin with gzip's magic number, whatever the file's name."""
+    content = path.read_bytes()
+    return gzip.decompress(content) if content.startswith(b"\x1f\x8b") else content
+
+
 def existing(path: str | os.PathLike[str]) -> Path:
     """Return the path of a file; raise FileNotFoundError if it does not exist or is a folder."""
     file = Path(path)
@@ -94,30 +100,32 @@ def existing(path: str | os.PathLike[str]) -> Path:
     return file
 
 
-def content_of(path: Path) -> bytes:
-    """Return the bytes of a file, decompressed if they begin with gzip's magic number, whatever the file's name."""
-    content = path.read_bytes()
-    return gzip.decompress(content) if content.startswith(b"\x1f\x8b") else content
+class UnsuitedError(Exception):
+    """The error within `reading` for a file that is not damaged, but has other content than expected."""
 
 
 @contextmanager
-def reading(path: str | os.PathLike[str], kind: str) -> Iterator[None]:
-    """Convert every error that a library raises for the content of a file to a ValueError that names the file.
+def reading(path: str | os.PathLike[str], kind: str) -> Iterator[Path]:
+    """Yield the path of an existing file, and convert every error of the body to a ValueError that names the file.
 
     For damaged files, libraries raise nearly any error, such as IndexError, zlib.error, or MemoryError for impossible
     sizes. The body should contain only the library's call and checks of its result. ``kind`` is the kind of file with
-    its article, as in ``"a readable npz archive"``.
+    its article, as in ``"a readable npz archive"``. The message says that the file is damaged, except for an
+    `UnsuitedError`.
     """
+    file = existing(path)
     try:
-        yield
+        yield file
     except ImportError:
         raise
+    except UnsuitedError as error:
+        raise ValueError(f"{file}: {error}") from error
     except (Exception, SystemExit) as error:
         reason = " ".join(str(error).split())[:300] or type(error).__name__
         if isinstance(error, KeyError):
             reason = f"it lacks {reason}"
         raise ValueError(
-            f"{os.fspath(path)}: the file is damaged or not {kind} ({reason}). Copy it again from an intact file"
+            f"{file}: the file is damaged or not {kind} ({reason}). Copy it again from an intact file"
         ) from error
 
 
@@ -126,8 +134,8 @@ def load_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
 
     Raises ValueError if the file is damaged, is not such an archive, or contains pickled objects.
     """
-    file, arrays = existing(path), {}
-    with reading(file, "a readable npz archive of plain arrays"), zipfile.ZipFile(file) as archive:
+    arrays = {}
+    with reading(path, "a readable npz archive of plain arrays") as file, zipfile.ZipFile(file) as archive:
         _check_number(file, archive)
         for name in archive.namelist():
             content = archive.read(name)  # reading to the end verifies the checksum
@@ -160,8 +168,7 @@ def load_npy(path: str | os.PathLike[str]) -> np.ndarray:
 
     The format has no checksum; only the file's length is compared with the declared length.
     """
-    file = existing(path)
-    with reading(file, "a readable npy array"), open(file, "rb") as stream:
+    with reading(path, "a readable npy array") as file, open(file, "rb") as stream:
         return _array(stream, file.stat().st_size)
 
 

@@ -73,6 +73,7 @@ CALLS: dict[str, Callable[[], Any]] = {
     "assemble": lambda: hj.assemble(field(), "mean"),
     "assemble with fields": lambda: hj.assemble(field(), potential=potential, density=np.ones(SHAPE)),
     "assemble cancelling": lambda: hj.assemble(field(), quadrature="cancelling"),
+    "assemble_forms": lambda: hj.assemble_forms(field(), fields={"potential": potential}),
     "assemble a mesh": lambda: hj.assemble(surface(), degree=2),
     "biharmonic_distance": lambda: hj.biharmonic_distance(pairs(), SOURCE),
     "boundary_influence": lambda: hj.boundary_influence(pairs(), TIMES),

@@ -19,9 +19,9 @@ from hks_jax.cli.computation import describe_input
 from hks_jax.cli.outputs import Done
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import Reading, read
-from hks_jax.io import find_invalid, save_tensors
+from hks_jax.io import save_tensors
 from hks_jax.io.formats import WRITTEN
-from hks_jax.io.repair import describe_invalid
+from hks_jax.io.repair import describe_invalid, invalid_in
 
 USAGE = "FILE OUT"
 
@@ -45,8 +45,9 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     if args.output.is_dir():
         raise IsADirectoryError(f"OUT: got the folder {args.output}; expected a file")
     volume = read(Reading.of(args), progress)
-    if (bad := find_invalid(volume)).any():
-        progress.warn(f"{int(bad.sum())} tensors are {describe_invalid(volume, bad)}; written unchanged, see --repair")
+    found = invalid_in(volume)
+    if count := int(found.bad.sum()):
+        progress.warn(f"{count} tensors are {describe_invalid(volume, found)}; written unchanged, see --repair")
     with progress.stage("writing", str(args.output)):
         save_tensors(args.output, volume, provenance={"command": sys.argv, "repair": dict(volume.repair) or None})
-    return Done([args.output], {**describe_input(volume), "not_positive_definite": int(bad.sum())})
+    return Done([args.output], {**describe_input(volume), "not_positive_definite": count})

@@ -29,11 +29,11 @@ from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.parsing import boundary_conditions, weight
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import require_one
-from hks_jax.domain.tensor_field import diffusion_tensors
+from hks_jax.domain import spd
 from hks_jax.fem.boundary import unreached_sides
-from hks_jax.io import ORDERS, find_invalid, read_tensors, save, save_tensors
+from hks_jax.io import ORDERS, read_tensors, save, save_tensors
 from hks_jax.io.formats import format_of
-from hks_jax.io.repair import describe_invalid
+from hks_jax.io.repair import describe_invalid, invalid_in
 from hks_jax.io.result import Result, plain, tuples
 from hks_jax.io.volume import TensorVolume, digest, require_position
 
@@ -257,9 +257,10 @@ def _initial(args: argparse.Namespace, target: TensorVolume, grid: Grid, progres
             "all nodes of the target. Restrict the target to the mask of --init"
         )
     volume = volume.with_mask(grid.mask)
-    if (bad := find_invalid(volume)).any():
+    found = invalid_in(volume)
+    if count := int(found.bad.sum()):
         raise ValueError(
-            f"--init: {int(bad.sum())} of {int(grid.inside.sum())} tensors are {describe_invalid(volume, bad)}. Write "
+            f"--init: {count} of {int(grid.inside.sum())} tensors are {describe_invalid(volume, found)}. Write "
             f"repaired tensors by 'hks-jax convert {args.init} repaired.npz --repair nearest', and pass that file"
         )
     metric: Any = args.metric or (None if fick else "tensor")
@@ -271,8 +272,10 @@ def _write(args: argparse.Namespace, fit: Any, target: Result, report: dict[str,
     from hks_jax.plot import fit_panels, save_figure
     from hks_jax.plot.signature import placed
 
-    tensors = diffusion_tensors(fit.field) if args.operator == "fick" else fit.field.domain_tensors
-    volume = replace(target.volume, tensors=np.asarray(tensors), order="matrix", frame="voxel")
+    tensors = np.asarray(fit.field.domain_tensors)
+    if args.operator == "fick":
+        tensors = spd.inverse(tensors)  # D, in place of the metric D⁻¹
+    volume = replace(target.volume, tensors=tensors, order="matrix", frame="voxel")
     volume = replace(volume, source=target.source, digest=digest(target.source), notes=(), unit="")
     history = {"losses": "loss", "misfits": "misfit", "stages": "stage", "starts": "start"}
     columns = {name: np.array([getattr(step, of) for step in fit.history]) for name, of in history.items()}

@@ -17,31 +17,27 @@ import json
 import math
 import shlex
 from collections.abc import Mapping
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from hks_jax.cli import options
 from hks_jax.cli.computation import times_in_words
+from hks_jax.cli.meshes import describe_mesh
 from hks_jax.cli.pairs import arrays_in
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import Reading, outside_note, read, without_element
 from hks_jax.domain.components import label_nodes
-from hks_jax.domain.simplices import WORDS, signed_measure
-from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_checks import MANY, unsymmetric
 from hks_jax.fem.boundary import BoundarySpec, default_boundary
-from hks_jax.io import TensorVolume, find_invalid, read_mesh
-from hks_jax.io.mesh import arrays_by_place, is_mesh
-from hks_jax.io.repair import least_admissible
+from hks_jax.io import TensorVolume
+from hks_jax.io.mesh import is_mesh, load_mesh
+from hks_jax.io.repair import invalid_in
 from hks_jax.io.result import NAMES, Result, signature_file
 from hks_jax.io.units import MEDIAN, MM2_PER_S, by_axis, is_plausible, unit_of_times
-from hks_jax.io.volume import digest
 from hks_jax.naming import with_option
-from hks_jax.signatures.times import FREE, suitable, suitable_times
+from hks_jax.signatures.times import FREE, suitable
 
 USAGE = "FILE"
 
@@ -62,8 +58,8 @@ def run(args: argparse.Namespace, progress: Progress) -> None:
     if result is not None:
         description = _describe_result(result)
     elif is_mesh(args.file):
-        description = {"file": str(args.file), **describe_mesh(args.file, read_mesh(args.file, clean=args.clean))}
-        description["arrays"] = listed(arrays_by_place(args.file, args.clean))
+        found = load_mesh(args.file, args.clean)
+        description = {"file": str(args.file), **describe_mesh(args.file, found.mesh), "arrays": listed(found.arrays)}
     else:
         description = {
             **describe(args.file, read(Reading.of(args), progress, questions.append)),
@@ -108,8 +104,8 @@ def _shares(result: Result) -> str:
 
 def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = None) -> dict[str, Any]:
     """Return facts about a volume for JSON. If `boundary` is None, `default_boundary` determines suitable k and t."""
-    inside, bad = volume.inside, find_invalid(volume)
-    not_positive = int(find_invalid(volume, 0.0).sum())
+    inside, found = volume.inside, invalid_in(volume)
+    bad = found.bad
     boundary = default_boundary(inside)[0] if boundary is None else boundary
     good = inside & ~bad
     labels, count = label_nodes(inside, (False,) * volume.dimension)
@@ -127,9 +123,9 @@ def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = N
         "without_element": int(without_element(volume).sum()),
         "boundary": boundary,
         "component_sizes": np.sort(np.bincount(labels.ravel())[1:])[::-1][:10].tolist(),
-        "not_positive_definite": not_positive,
-        "nearly_singular": int(bad.sum()) - not_positive,
-        "least_admissible_eigenvalue": least_admissible(volume),
+        "not_positive_definite": int((bad & ~found.singular).sum()),
+        "nearly_singular": int(found.singular.sum()),
+        "least_admissible_eigenvalue": found.floor,
         "not_symmetric": int((inside & unsymmetric(volume.tensors)).sum()),
     }
     wrong = volume.invalid_by_order
@@ -147,28 +143,6 @@ def describe(path: Path, volume: TensorVolume, boundary: BoundarySpec | None = N
         description["suits"] = {name: suitable(g, volume.spacing, inside, boundary) for name, g in metrics.items()}
         description["time_units"] = {name: unit_of_times(volume, name) for name in metrics}
     return description
-
-
-def describe_mesh(path: Path, mesh: SimplicialMesh) -> dict[str, Any]:
-    """Return facts about a mesh in space for JSON."""
-    vertices, cells, d = np.asarray(mesh.vertices, np.float64), mesh.triangulation.cells, mesh.triangulation.dimension
-    measure = float(np.sum(signed_measure(vertices, cells)[0])) / math.factorial(d)
-    sides = [vertices[cells[:, i]] - vertices[cells[:, j]] for i, j in combinations(range(d + 1), 2)]
-    edge = float(np.median(np.linalg.norm(np.concatenate(sides), axis=1)))
-    size, rim = float(np.linalg.norm(np.ptp(vertices, axis=0))), mesh.triangulation.boundary_vertices
-    used = mesh.triangulation.used
-    depth = float(np.median(cKDTree(vertices[rim]).query(vertices[used])[0])) if rim.any() else math.inf
-    return {
-        "sha256": digest(path),
-        "format": path.suffix,
-        "vertices": len(vertices),
-        WORDS[d].simplices: len(cells),
-        "boundary_vertices": int(rim.sum()),
-        "components": mesh.triangulation.labels[1],
-        WORDS[d].measure: measure,
-        "median_edge": edge,
-        "suits": {{2: "surface", 3: "solid"}[d]: suitable_times(d, measure, edge**2, size, len(vertices), depth=depth)},
-    }
 
 
 def listed(arrays: Mapping[str, Mapping[str, np.ndarray]]) -> list[dict[str, Any]]:

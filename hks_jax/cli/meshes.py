@@ -1,29 +1,33 @@
 """Read a mesh, with the metric that tensors give it, from the options of meshes."""
 
 import argparse
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool
+from scipy.spatial import cKDTree
 
-from hks_jax import TetMesh
 from hks_jax.cli.computation import Domain, Mesh, OfMesh, Settings, use_dtype
-from hks_jax.cli.info import describe_mesh, listed
 from hks_jax.cli.options import add_reading, defaults, refuse
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import Reading, read, require_one
+from hks_jax.domain.simplices import WORDS, signed_measure
+from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.fem.assembly import MESH_BOUNDARIES
-from hks_jax.io import TensorVolume, read_mask, read_mesh, sample_tensors
-from hks_jax.io.cortex import MAPS, structure_of
-from hks_jax.io.mesh import WRITTEN, arrays_by_place, is_surface
+from hks_jax.io import TensorVolume, read_mask, sample_tensors
+from hks_jax.io.mesh import load_mesh
 from hks_jax.io.repair import require_valid
 from hks_jax.io.sampling import OutsideMaskError
 from hks_jax.io.tensor_order import Order, matrices
+from hks_jax.io.volume import digest
 from hks_jax.optional import optional
+from hks_jax.signatures.times import suitable_times
 
 OF_TENSORS = ("metric", "operator", "order", "interpolation")
 """Options that refer to tensors of a mesh."""
@@ -71,17 +75,6 @@ def require_mesh_options(args: argparse.Namespace) -> None:
     require_one(args.metric, args.operator)
 
 
-def _images(file: Path, mesh: Mesh, clean: bool) -> tuple[tuple[str, ...], dict[str, str]]:
-    """Return the suffixes of results on a mesh, and entries for their provenance.
-
-    The suffixes are that of the mesh's file, or .vtu if its format has no values at vertices; and for a GIFTI or a
-    FreeSurfer surface also that of GIFTI's maps, unless the vertices may have been renumbered by cleaning.
-    """
-    suffix = file.suffix.lower()
-    own = ".vtu" if suffix not in WRITTEN or (suffix == ".ply" and isinstance(mesh, TetMesh)) else suffix
-    return ((own, MAPS), structure_of(file)) if is_surface(file) and not clean else ((own,), {})
-
-
 def read_domain(mesh_file: MeshFile, settings: Settings, progress: Progress) -> OfMesh:
     """Read a mesh in the chosen precision, with the metric of tensors in a volume or in an array of its file, if any.
 
@@ -97,7 +90,8 @@ def read_domain(mesh_file: MeshFile, settings: Settings, progress: Progress) -> 
 
 def _with_metric(mesh_file: MeshFile, volume: TensorVolume | None, settings: Settings, progress: Progress) -> OfMesh:
     file, dtype = mesh_file.file, settings.dtype
-    mesh = read_mesh(file, clean=mesh_file.clean, in_space=volume is not None)
+    found = load_mesh(file, mesh_file.clean, in_space=volume is not None)
+    mesh = found.mesh
     vertices, cells = np.asarray(mesh.vertices).astype(dtype), mesh.triangulation.cells
     kind: Any = type(mesh)
     mask = None if mesh_file.inside is None else _inside(mesh_file.inside, len(vertices))
@@ -113,8 +107,8 @@ def _with_metric(mesh_file: MeshFile, volume: TensorVolume | None, settings: Set
         return with_metric
 
     def made(mesh: Mesh, *tensors: Any) -> OfMesh:
-        images, origin = _images(file, mesh, mesh_file.clean)
-        return Domain(mesh, mesh, {"source": str(file), **describe_mesh(file, mesh)}, images, origin, *tensors)
+        about = {"source": str(file), **describe_mesh(file, mesh)}
+        return Domain(mesh, mesh, about, found.written, found.origin, *tensors)
 
     if volume is not None:
         at = np.arange(len(vertices)) if mask is None else np.flatnonzero(mask)
@@ -132,23 +126,45 @@ def _with_metric(mesh_file: MeshFile, volume: TensorVolume | None, settings: Set
             return of_tensors(tensors)
 
         return made(sampled(volume.tensors), volume.tensors, sampled, volume)
-    arrays = arrays_by_place(file, mesh_file.clean)
     if mesh_file.array is None:
-        _tell_of_tensors(arrays, progress)
+        _tell_of_tensors(found.arrays, progress)
         return made(kind(vertices, cells, mask=mask))
-    tensors, place = _tensors_in(arrays, mesh_file.array, mesh_file.order, progress)
+    tensors, place = _tensors_in(found.arrays, mesh_file.array, mesh_file.order, progress)
     return made(of_tensors(tensors.astype(dtype), place), tensors.astype(dtype), partial(of_tensors, at=place))
+
+
+def describe_mesh(path: Path, mesh: SimplicialMesh) -> dict[str, Any]:
+    """Return facts about a mesh in space for JSON."""
+    vertices, cells, d = np.asarray(mesh.vertices, np.float64), mesh.triangulation.cells, mesh.triangulation.dimension
+    measure = float(np.sum(signed_measure(vertices, cells)[0])) / math.factorial(d)
+    sides = [vertices[cells[:, i]] - vertices[cells[:, j]] for i, j in combinations(range(d + 1), 2)]
+    edge = float(np.median(np.linalg.norm(np.concatenate(sides), axis=1)))
+    size, rim = float(np.linalg.norm(np.ptp(vertices, axis=0))), mesh.triangulation.boundary_vertices
+    used = mesh.triangulation.used
+    depth = float(np.median(cKDTree(vertices[rim]).query(vertices[used])[0])) if rim.any() else math.inf
+    return {
+        "sha256": digest(path),
+        "format": path.suffix,
+        "vertices": len(vertices),
+        WORDS[d].simplices: len(cells),
+        "boundary_vertices": int(rim.sum()),
+        "components": mesh.triangulation.labels[1],
+        WORDS[d].measure: measure,
+        "median_edge": edge,
+        "suits": {{2: "surface", 3: "solid"}[d]: suitable_times(d, measure, edge**2, size, len(vertices), depth=depth)},
+    }
 
 
 def _tell_of_tensors(arrays: Mapping[str, Mapping[str, np.ndarray]], progress: Progress) -> None:
     """Print a note about arrays that may be tensors."""
-    for each in (each for each in listed(arrays) if each["components"] in (6, 9)):
-        progress.note(
-            f"the {each['components']} components of {each['name']} at the {each['at']} are not used, and the mesh "
-            f"has the Euclidean metric. To use them, pass --array {each['name']}"
-            + " and --order"
-            * (each["components"] == 6)
-        )
+    for at, named in arrays.items():
+        for name, values in named.items():
+            components = math.prod(values.shape[1:])
+            if components in (6, 9):
+                progress.note(
+                    f"the {components} components of {name} at the {at} are not used, and the mesh has the Euclidean "
+                    f"metric. To use them, pass --array {name}" + " and --order" * (components == 6)
+                )
 
 
 def _tensors_in(

@@ -48,12 +48,13 @@ def check_noise(args: argparse.Namespace) -> None:
 
 def signature_of(solved: Solved, noise: Noise | None, progress: Progress) -> Result:
     """Compute the signature of a domain from its eigenpairs, with error bars unless `noise` is None."""
-    if noise is None:
-        return result_of(solved, progress)
     settings = solved.settings
-    bars, maps, interior, times = _error_bars(solved, noise, progress)
-    chosen = replace(settings, times=Times(times, settings.times.automatic))
-    result = result_of(solved._replace(settings=chosen), progress)
+    if noise is not None:
+        bars, maps, interior, times = _error_bars(solved, noise, progress)
+        settings = replace(settings, times=Times(times, settings.times.automatic))
+    result = result_of(solved._replace(settings=settings), progress)
+    if noise is None:
+        return result
     ratio = np.asarray(bars.signal_to_noise_at(interior))
     nodes = np.isfinite(np.asarray(bars.value[0])).sum()
     clear = np.flatnonzero(ratio > _CLEAR)

@@ -61,7 +61,8 @@ def writing(
     At the end, report.json is also written, all files are moved to `folder` atomically, and `stale` files are deleted.
     The functions in `pictures`, by name of the file, draw afterwards, so that a failure leaves the results.
     """
-    done, pictures = Done([], {}), pictures or {}
+    pictures, summary = pictures or {}, dict[str, Any]()
+    done = Done([], summary)
 
     def replaced() -> Iterable[Path]:
         return {*stale(), *(folder / name for name in pictures)}
@@ -70,8 +71,8 @@ def writing(
         yield temporary, done
         seconds = {stage: round(spent, 3) for stage, spent in progress.timings.items()}
         known = {"warnings": progress.warnings, "versions": versions(), "seconds": seconds}
-        done.summary.update(plain({"command": sys.argv, **report, **known}))
-        write_json(temporary / REPORT, done.summary)
+        summary |= plain({"command": sys.argv, **report, **known})
+        write_json(temporary / REPORT, summary)
         done.files.extend(folder / file.name for file in temporary.iterdir())
     said = len(progress.warnings)
     for name, draw in pictures.items():
@@ -80,8 +81,8 @@ def writing(
         done.files.append(folder / name)
     done.files.sort()
     if len(progress.warnings) > said:
-        done.summary["warnings"] = list(progress.warnings)
-        write_json(folder / REPORT, done.summary)
+        summary["warnings"] = list(progress.warnings)
+        write_json(folder / REPORT, summary)
 
 
 def draw_picture(path: Path, draw: Callable[[Path], Any], results: Iterable[Path]) -> None:

@@ -178,16 +178,12 @@ def sliced(volume: TensorVolume, axis: str, index: int) -> TensorVolume:
         raise ValueError(f"--slice: {error}") from error
 
 
-def _load(reading: Reading) -> tuple[TensorVolume, np.ndarray | None]:
-    """Return the volume, and the mask of ``--mask`` unless the volume has this mask already."""
+def _require_fitting_options(reading: Reading) -> None:
+    """Raise ValueError for options of tensors beside diffusion-weighted images, and for options of images without."""
     if reading.bval is None and reading.bvec is None:
         refuse(reading, ("b_max",), "this option is for diffusion-weighted images; pass --bval and --bvec too")
         refuse(reading, ("bvec_frame",), "this option is for diffusion-weighted images; for tensors pass --frame")
-        spacing = reading.spacing[0] if reading.spacing is not None and len(reading.spacing) == 1 else reading.spacing
-        files = [reading.file, *reading.others] if reading.others else reading.file
-        more = {name: getattr(reading, name) for name in ("frame", "array", "confidence", "unit")}
-        volume = read_tensors(files, reading.order, spacing=spacing, **more)
-        return volume, None if reading.mask is None else read_mask(reading.mask, volume.affine)
+        return
     if reading.others:
         raise ValueError(
             f"FILE: got {1 + len(reading.others)} files; expected one file of all images for --bval, --bvec"
@@ -196,6 +192,17 @@ def _load(reading: Reading) -> tuple[TensorVolume, np.ndarray | None]:
         raise ValueError("--bval, --bvec: got one option; expected both for diffusion-weighted images")
     refuse(reading, ("frame",), "this option is for files of tensors; pass --bvec-frame")
     refuse(reading, ("order", "array", "spacing"), "this option is for files of tensors; leave it out with --bval")
+
+
+def _load(reading: Reading) -> tuple[TensorVolume, np.ndarray | None]:
+    """Return the volume, and the mask of ``--mask`` unless the volume has this mask already."""
+    _require_fitting_options(reading)
+    if reading.bval is None or reading.bvec is None:
+        spacing = reading.spacing[0] if reading.spacing is not None and len(reading.spacing) == 1 else reading.spacing
+        files = [reading.file, *reading.others] if reading.others else reading.file
+        more = {name: getattr(reading, name) for name in ("frame", "array", "confidence", "unit")}
+        volume = read_tensors(files, reading.order, spacing=spacing, **more)
+        return volume, None if reading.mask is None else read_mask(reading.mask, volume.affine)
     noise: Literal["residuals"] | None = "residuals" if reading.noise == "residuals" else None
     of: Any = {"unit": reading.unit, "noise": noise, "bvec_frame": reading.bvec_frame or "fsl"}
     return fit_dwi(reading.file, reading.bval, reading.bvec, reading.mask, reading.b_max, **of), None

@@ -33,14 +33,17 @@ def read_source(args: argparse.Namespace, progress: Progress, boundary: Boundary
         require_mesh_options(args)
         settings = Settings.of(args, metric=args.metric, boundary=boundary)
         return Source(read_domain(MeshFile.of(args, args.file), settings, progress), settings)
+    saved_before = not args.others and saved_pairs.is_saved_pairs(args.file)
     refuse(args, ("clean", "inside"), "this option is for meshes; for tensors on a grid, see --repair and --mask")
     refuse(args, ("tensors",), "this option is for a mesh inside a volume; leave it out for the volume itself")
-    settings = Settings.of(args, boundary=boundary)
-    if not args.others and saved_pairs.is_saved_pairs(args.file):
+    if saved_before:
         refuse(args, ("noise",), NO_NOISE)
         why = f"the eigenpairs in {args.file} determine this setting; leave the option out"
         refuse(args, (*defaults(add_metric, add_reading, add_solving), "save_pairs"), why)
+    settings = Settings.of(args, boundary=boundary)
+    if saved_before:
         saved = saved_pairs.read_pairs(args.file, settings, progress)
         return Source(saved.domain, saved.settings, saved)
     volume = read_volume(Reading.of(args), progress)
-    return Source(domain_of_volume(volume, settings, format_of(args.file).image), settings)
+    image = format_of(args.file).image
+    return Source(domain_of_volume(volume, settings, image), settings)

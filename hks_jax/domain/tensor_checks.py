@@ -90,7 +90,7 @@ def require_spd(
                 "Noise rarely makes this many tensors indefinite. If the tensors describe stress or strain, make a "
                 f"metric by hks_jax.TensorField.from_indefinite. {_MASK}, if they are outside the domain"
             )
-        refuse(name, bad, inside, place, what, of_grids if place == "node" else "Raise their eigenvalues")
+        refuse_tensors(name, bad, inside, place, what, of_grids if place == "node" else "Raise their eigenvalues")
     # The determinant is computed in the dtype of the tensors, where it may underflow to 0 or overflow.
     d, limits = tensors.shape[-1], np.finfo(tensors.dtype if tensors.dtype.kind == "f" else np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):  # outside the mask
@@ -98,7 +98,7 @@ def require_spd(
     bad = inside & ~((digits > np.log10(limits.tiny)) & (digits < np.log10(limits.max)))
     if bad.any():
         what = f"so small or large that their determinant, about 1e{digits[bad][0]:.0f}, is not a {limits.dtype} number"
-        refuse(name, bad, inside, place, what, "Use another unit, in which the eigenvalues are near 1")
+        refuse_tensors(name, bad, inside, place, what, "Use another unit, in which the eigenvalues are near 1")
 
 
 def require_finite_symmetric(
@@ -107,11 +107,11 @@ def require_finite_symmetric(
     """Raise ValueError unless the tensors inside the mask are finite and symmetric; see `require_spd`."""
     bad = inside & ~np.isfinite(tensors).all(axis=(-2, -1))
     if bad.any():
-        refuse(name, bad, inside, place, "NaN or infinite", _MASK if place == "node" else "Replace them")
+        refuse_tensors(name, bad, inside, place, "NaN or infinite", _MASK if place == "node" else "Replace them")
     bad = inside & unsymmetric(tensors)
     if bad.any():
         what = "Pass (T + Tᵀ)/2 if the difference is noise, or check the component order"
-        refuse(name, bad, inside, place, "unsymmetric", what)
+        refuse_tensors(name, bad, inside, place, "unsymmetric", what)
 
 
 _MASK = "Exclude these nodes by the grid's mask"
@@ -128,7 +128,7 @@ def least_eigenvalue(tensors: Float[np.ndarray, "n d d"]) -> float:
     return float(np.linalg.eigvalsh(tensors.astype(np.float64)).min())
 
 
-def refuse(
+def refuse_tensors(
     name: str, bad: Bool[np.ndarray, "*shape"], inside: Bool[np.ndarray, "*shape"], place: str, what: str, remedy: str
 ) -> NoReturn:
     """Raise ValueError about invalid tensors, with their number, the first place, the defect and the remedy."""
@@ -185,7 +185,7 @@ NUMBERS = {"exp": "scale", "shift": "shift"}
 
 def positive_map(
     name: str,
-    tensors: Float[Array, "*shape d d"],
+    tensors: Any,
     how: PositiveMap | None,
     number: Any,
     inside: Bool[np.ndarray, "*shape"],
@@ -202,6 +202,7 @@ def positive_map(
     if number is None:
         raise ValueError(f"number: got None; how={how!r} requires the {NUMBERS[how]}, in the units of {name}")
     require_number("number", number, above=0.0 if how == "exp" else -math.inf)
+    tensors = real_array(name, tensors)
     known = not is_traced((tensors, number))
     if known:
         require_finite_symmetric(name, np.asarray(tensors), inside, place)

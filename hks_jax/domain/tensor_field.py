@@ -280,16 +280,6 @@ def _metric_of_diffusion(xp: Any, D: Any, metric: MetricChoice) -> Any:
     return spd.metric_of_diffusion(spd.nan_unless_positive(xp, D), metric)
 
 
-def diffusion_tensors(field: TensorField) -> Float[Array, "*shape d d"]:
-    """Return the tensors D = T⁻¹ of Fick's operator at the nodes: the identity outside the mask, NaN for a bad T."""
-    return _inverse(field.domain_tensors)
-
-
-@numpy_where_known()
-def _inverse(xp: Any, tensors: Any) -> Any:
-    return spd.inverse(tensors)
-
-
 def require_laplace_beltrami(field: TensorField, what: str) -> None:
     """Raise ValueError if the field's operator is not that of its metric."""
     if field.operator != "laplace-beltrami":

@@ -28,24 +28,21 @@ MESH_BOUNDARIES = ("neumann", "dirichlet", "mean")
 def assemble(
     domain: TensorField | SimplicialMesh,
     boundary: BoundarySpec = "neumann",
-    mass: MassKind | Form = "consistent",
+    mass: MassKind = "consistent",
     *,
     potential: Any = None,
     density: Any = None,
-    stiffness: Form | None = None,
-    fields: Mapping[str, Any] | None = None,
-    components: int = 1,
     degree: int = 1,
     midpoints: Any = None,
     quadrature: Quadrature = "gauss",
 ) -> AnyPencil:
-    """Assemble the generalized eigenproblem Kφ = λMφ of the domain's operator, or of another operator.
+    """Assemble the generalized eigenproblem Kφ = λMφ of the domain's operator.
 
     With the metric T and the basis functions hᵢ, K_ij = ∫ √|T| T⁻¹∇hᵢ·∇hⱼ dx and M_ij = ∫ √|T| hᵢhⱼ dx (Zobel,
     Reininghaus and Hotz, section 3). A domain with ``operator="fick"`` has K_ij = ∫ D∇hᵢ·∇hⱼ dx and M_ij = ∫ hᵢhⱼ dx,
     where dx replaces the volume element √|T| dx everywhere below, and D = T⁻¹ is interpolated. On grids the elements
     are Q1 with 2^d Gauss points, and T or its logarithm is interpolated multilinearly (see `TensorField`). On meshes
-    the elements are P1 or P2, and T is constant on each cell.
+    the elements are P1 or P2, and T is constant on each cell. `assemble_forms` assembles operators of your own.
 
     A *field* is a number, an array over the nodes, an array over the elements, or a function of position that JAX can
     trace. An array over the nodes, (*shape) or (V,), is interpolated. An array over the elements has n − 1 entries
@@ -61,20 +58,10 @@ def assemble(
             condition on the rim of a mask is natural, except with ``"mean"`` and ``"dirichlet-rim"``, which act on the
             rim and on all sides. A further entry after those of the axes sets the condition on the rim: ``("periodic",
             "periodic", "dirichlet")``. On meshes ``"neumann"``, ``"dirichlet"`` and ``"mean"`` act on the boundary.
-        mass: ``"consistent"``, ``"lumped"`` (the diagonal matrix of row sums), or your own form.
+        mass: ``"consistent"``, or ``"lumped"`` (the diagonal matrix of row sums).
         potential: a field V of either sign; the operator becomes −Δ + V.
         density: a positive field ρ; the operator becomes −ρ⁻¹ div(ρ ∇·), in L² with the volume element ρ√|T| dx. With
             Fick's operator it is −ρ⁻¹ div(ρD∇·), with the volume element ρ dx.
-        stiffness: your own form, which replaces potential and density: a function ``form(u, v, w)`` that is linear in u
-            and in v and returns one number. The shape functions u and v have ``.value`` and ``.grad``. The point w has
-            the metric ``.metric`` (d, d), its inverse ``.inverse``, the position ``.x`` and the fields ``w["name"]``.
-            The number that `form` returns is integrated with the volume element √|T| dx. On meshes, gradients and
-            metric have components along the axes of space; on a surface, gradients and metric are tangential. Define a
-            form once: each new function is compiled anew (docs/operators.md).
-        fields: the fields that your forms read, by name; they may have further axes after those of nodes or elements.
-        components: the number c of components of a function. For c > 1, as in elasticity, ``u.value`` is (c,),
-            ``u.grad`` is (c, d) with ``grad[i, j]`` = ∂uᵢ/∂xⱼ, and results have an axis of length c after those of the
-            nodes.
         degree: 1 or, on meshes, 2. For degree 2, nodal arrays have the values at the V vertices, followed by the values
             at the midpoints of the edges ``domain.triangulation.edges``.
         midpoints: for degree 2, the positions (E, 3) of the edges' midpoints, which curve the edges; or a function from
@@ -86,13 +73,12 @@ def assemble(
 
     Returns:
         The pencil (stiffness, mass). With ``"mirror"`` and ``"mean"`` the result is the `MirrorPencil` of the problems
-        into which the doubled domain decomposes. With a potential or your own form, the null space is not known.
+        into which the doubled domain decomposes. With a potential, the null space is not known.
 
     Raises:
         ValueError: an unknown boundary, mass, degree or quadrature; a domain without elements or free nodes; ``"mean"``
-            without a rim; a field that has another shape or contains NaN; a density that is not positive; a form that
-            does not return one number, is not linear, or has an unsymmetric matrix (the message has the entry);
-            ``"cancelling"`` with a mesh, a lumped mass or your own form.
+            without a rim; a field that has another shape or contains NaN; a density that is not positive;
+            ``"cancelling"`` with a mesh or a lumped mass.
 
     Warns:
         AccuracyWarning: a Dirichlet condition holds at no node of the domain.
@@ -102,18 +88,97 @@ def assemble(
         >>> print((pencil.mass @ one).sum().round(1), jnp.abs(pencil.stiffness @ one).max().round(3))  # area; K1 = 0
         2.0 0.0
     """
-    operator, given = _checked_operator(mass, stiffness, components, potential, density, fields)
+    if mass not in get_args(MassKind):
+        forms = ". `assemble_forms` takes a form of your own" * callable(mass)
+        raise ValueError(f'mass: got {mass!r}; expected "consistent" or "lumped"{forms}')
     if quadrature not in get_args(Quadrature):
         raise ValueError(f'quadrature: got {quadrature!r}; expected "gauss" or "cancelling"')
     if quadrature == "cancelling":
         for what, is_given in (
             ("a mesh, for which no cancelling points are known", isinstance(domain, SimplicialMesh)),
-            ("a lumped mass, for which no cancelling points exist", operator.lumped),
-            ("your own form, whose error is not known", operator.own),
+            ("a lumped mass, for which no cancelling points exist", mass == "lumped"),
         ):
             if is_given:
                 raise ValueError(f'quadrature: got "cancelling" with {what}; expected "gauss"')
-        operator = operator._replace(cancelling=True)
+    given = {name: value for name, value in (("potential", potential), ("density", density)) if value is not None}
+    operator = WeakForm(laplace_beltrami, l2, mass == "lumped", cancelling=quadrature == "cancelling")
+    return _assembled(domain, boundary, operator, given, degree, midpoints)
+
+
+def assemble_forms(
+    domain: TensorField | SimplicialMesh,
+    stiffness: Form = laplace_beltrami,
+    mass: MassKind | Form = "consistent",
+    boundary: BoundarySpec = "neumann",
+    *,
+    fields: Mapping[str, Any] | None = None,
+    components: int = 1,
+    degree: int = 1,
+    midpoints: Any = None,
+) -> AnyPencil:
+    """Assemble the generalized eigenproblem Kφ = λMφ of weak forms of your own.
+
+    A form is a function ``form(u, v, w)`` that is linear in u and in v and returns one number, which is integrated with
+    the volume element √|T| dx (dx for a domain with ``operator="fick"``). The shape functions u and v have ``.value``
+    and ``.grad``. The point w has the metric ``.metric`` (d, d), its inverse ``.inverse``, the position ``.x`` and the
+    fields ``w["name"]``. On meshes, gradients and metric have components along the axes of space; on a surface,
+    gradients and metric are tangential. Define a form once: each new function is compiled anew (docs/operators.md).
+
+    Args:
+        domain: a tensor field, a `SurfaceMesh` or a `TetMesh`.
+        stiffness: the form of K, by default that of the Laplace–Beltrami operator.
+        mass: the form of M; or ``"consistent"`` or ``"lumped"``, as in `assemble`.
+        boundary: as in `assemble`.
+        fields: the fields that the forms read, by name (see `assemble`); they may have further axes after those of
+            nodes or elements.
+        components: the number c of components of a function. For c > 1, as in elasticity, ``u.value`` is (c,),
+            ``u.grad`` is (c, d) with ``grad[i, j]`` = ∂uᵢ/∂xⱼ, and results have an axis of length c after those of the
+            nodes.
+        degree: as in `assemble`.
+        midpoints: as in `assemble`.
+
+    Returns:
+        The pencil (stiffness, mass), as in `assemble`. Its null space is not known.
+
+    Raises:
+        ValueError: the errors of `assemble`; a form that does not return one number, is not linear, or has an
+            unsymmetric matrix (the message has the entry).
+
+    Warns:
+        AccuracyWarning: a Dirichlet condition holds at no node of the domain.
+
+    Examples:
+        >>> def energy(u, v, w):
+        ...     return u.grad @ w.inverse @ v.grad + w["V"] * u.value * v.value
+        >>> own, built_in = hj.assemble_forms(field, energy, fields={"V": 2.0}), hj.assemble(field, potential=2.0)
+        >>> print(jnp.abs(own.stiffness.to_dense() - built_in.stiffness.to_dense()).max() < 1e-6)
+        True
+    """
+    if mass not in get_args(MassKind) and not callable(mass):
+        raise ValueError(f'mass: got {mass!r}; expected "consistent", "lumped" or a form')
+    if not callable(stiffness):
+        raise ValueError(f"stiffness: got {type(stiffness).__name__}; expected a form: a function of u, v and w")
+    for name, form in (("stiffness", stiffness), ("mass", mass)):
+        if is_traced([cell.cell_contents for cell in getattr(form, "__closure__", None) or ()]):
+            raise ValueError(f"{name}: the form closes over traced arrays or numbers; pass all of them as fields={{…}}")
+    require_count("components", components)
+    if components > 1 and stiffness is laplace_beltrami:
+        raise ValueError("stiffness: got none with components > 1; expected a form for vector-valued functions")
+    if not isinstance(fields, Mapping | None):
+        raise ValueError(f"fields: got {describe_array(fields)}; expected a dictionary {{name: array}}")
+    operator = WeakForm(stiffness, mass if callable(mass) else l2, mass == "lumped", components, own=True)
+    return _assembled(domain, boundary, operator, dict(fields or {}), degree, midpoints)
+
+
+def _assembled(
+    domain: TensorField | SimplicialMesh,
+    boundary: BoundarySpec,
+    operator: WeakForm,
+    given: dict[str, Any],
+    degree: int,
+    midpoints: Any,
+) -> AnyPencil:
+    """Return the pencil of forms that read the given fields."""
     operator = operator._replace(fick=getattr(domain, "operator", None) == "fick")
     nodes = None
     if isinstance(domain, SimplicialMesh):
@@ -142,7 +207,7 @@ def assemble(
             got = f"degree {degree!r} and {'no' if midpoints is None else 'some'} midpoints"
             raise ValueError(f"degree, midpoints: got {got} for a grid, whose elements are Q1; leave both out")
         sides = normalise_boundary(boundary, domain.grid.dimension)
-        if components > 1 and any("mirror" in pair for pair in sides):
+        if operator.components > 1 and any("mirror" in pair for pair in sides):
             raise ValueError('boundary: got "mirror" with components; only scalar functions support "mirror"')
         spaces = [grid_space(domain.grid, problem) for problem in doubled_problems(sides)]
         if any("dirichlet" in pair for pair in sides) and (spaces[0].free == spaces[0].domain).all():
@@ -164,39 +229,6 @@ def assemble(
     if midpoints is not None and not is_traced(pencils) and np.isnan(pencils[0].mass.diagonal()).any():
         raise ValueError("midpoints: got positions that fold or invert cells; move them closer to the straight edges")
     return _joined(pencils, operator, "mirror" in str(boundary))
-
-
-def _checked_operator(
-    mass: MassKind | Form,
-    stiffness: Form | None,
-    components: int,
-    potential: Any,
-    density: Any,
-    fields: Mapping[str, Any] | None,
-) -> tuple[WeakForm, dict[str, Any]]:
-    if mass not in ("consistent", "lumped") and not callable(mass):
-        raise ValueError(f'mass: got {mass!r}; expected "consistent", "lumped" or a form')
-    if stiffness is not None and not callable(stiffness):
-        raise ValueError(f"stiffness: got {type(stiffness).__name__}; expected a form: a function of u, v and w")
-    for name, form in (("stiffness", stiffness), ("mass", mass)):
-        if is_traced([cell.cell_contents for cell in getattr(form, "__closure__", None) or ()]):
-            raise ValueError(f"{name}: the form closes over traced arrays or numbers; pass all of them as fields={{…}}")
-    require_count("components", components)
-    if not isinstance(fields, Mapping | None):
-        raise ValueError(f"fields: got {describe_array(fields)}; expected a dictionary {{name: array}}")
-    own, given = stiffness is not None or callable(mass), dict(fields or {})
-    named = {name: value for name, value in (("potential", potential), ("density", density)) if value is not None}
-    if own and named:
-        raise ValueError(
-            f"{', '.join(named)}: got a field with your own form; pass fields={{{next(iter(named))!r}: …}}, and use "
-            f"w[{next(iter(named))!r}] in the form"
-        )
-    if (given or components > 1) and not own:
-        raise ValueError("fields, components: only a form of your own can use them; pass a form as stiffness= or mass=")
-    if components > 1 and stiffness is None:
-        raise ValueError("stiffness: got None with components > 1; expected a form for vector-valued functions")
-    of_mass = mass if callable(mass) else l2
-    return WeakForm(stiffness or laplace_beltrami, of_mass, mass == "lumped", components, own), given | named
 
 
 def _joined(pencils: list[Pencil], operator: WeakForm, mirrored: bool) -> AnyPencil:

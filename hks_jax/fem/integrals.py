@@ -15,7 +15,7 @@ from hks_jax.compilation import jit_quickly, numpy_where_known
 from hks_jax.domain import spd
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.simplicial_mesh import SimplicialMesh, oriented
-from hks_jax.domain.tensor_field import TensorField, diffusion_tensors
+from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.elements import MASS, Element, element_matrices, moved, simplex_element, tensor_product_element
 from hks_jax.fem.fields import Field
 from hks_jax.fem.forms import WeakForm
@@ -33,17 +33,18 @@ def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace
     """Return the pencil of a field, or of one part of a doubled domain."""
     # Masks, element and spacing are passed as arrays, so that problems that differ only in these arrays share one
     # compilation. The element is computed in double precision, since its rounding would scale the whole metric.
-    tensors, spacing = diffusion_tensors(field) if operator.fick else field.tensors, np.array(field.grid.spacing)
+    tensors, spacing, density = field.tensors, np.array(field.grid.spacing), None
     element = tensor_product_element(space.dimension)
     table = element.gradients / spacing, element.weights * spacing.prod(), spacing
     gradients, weights, steps = (np.asarray(x, tensors.dtype) for x in table)
     domain, elements = (mask_for(tensors, mask) for mask in (space.domain, space.elements))
+    if operator.fick:
+        tensors, density = _diffusion(field.domain_tensors, domain)
     x = grid_points(field.grid, space, tensors.dtype) if operator.own else None
     geometry = Geometry(domain, elements, couplings_for(tensors, space), gradients, weights, steps, x)
     settings = Settings(space.periodic, field.interpolation, operator)
     *matrices, lumped, volume = _grid_integrals(settings, geometry, tensors, fields)
     metric = SampledMetric(jax.lax.stop_gradient(field.tensors), steps, field.interpolation, operator.fick)
-    density = _root(tensors, domain) if operator.fick else None
     if operator.components > 1:
         own, kept = vector_space(space, operator.components), np.flatnonzero(space.elements)
         one, other = (gathered(own, each[kept]) for each in matrices)
@@ -54,9 +55,10 @@ def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace
 
 
 @numpy_where_known()
-def _root(xp: Any, tensors: Any, domain: Any) -> Any:
-    """Return √|D| at the nodes of the domain, and 1 elsewhere."""
-    return xp.sqrt(xp.where(domain, spd.determinant(tensors), 1))
+def _diffusion(xp: Any, metric: Any, domain: Any) -> tuple[Any, Any]:
+    """Return the tensors D = T⁻¹ of Fick's operator, and √|D| at the nodes of the domain and 1 elsewhere."""
+    tensors = spd.inverse(metric)
+    return tensors, xp.sqrt(xp.where(domain, spd.determinant(tensors), 1))
 
 
 def grid_points(grid: Grid, space: GridSpace, dtype: Any) -> Float[Array, "*elements q d"]:

@@ -71,8 +71,7 @@ def resolution_of(metric: SampledMetric, space: FunctionSpace, lumped: bool, can
     """Return the resolution of the functions of a space, from the spacing of a grid or the edges of a mesh."""
     if isinstance(space, GridSpace):
         domain = mask_for(metric.tensors, space.domain)
-        settings = space.periodic, metric.interpolation, lumped, cancelling, metric.fick
-        return Resolution(*_of_grid(metric.tensors, domain, metric.spacing, *settings), order=1 + cancelling)
+        return Resolution(*_of_grid(metric, domain, space.periodic, lumped, cancelling), order=1 + cancelling)
     assert isinstance(space, MeshSpace)
     return _of_mesh(metric.tensors, space.triangulation.cells, space.triangulation.n_vertices, lumped)
 
@@ -189,24 +188,18 @@ def _neighbours(xp: Any, domain: Any, axis: int, wraps: bool) -> Any:
     return pairs & (xp.arange(n) < n - 1).reshape([-1 if a == axis else 1 for a in range(domain.ndim)])
 
 
-@numpy_where_known(static_argnums=(3, 4, 5, 6, 7))
+@numpy_where_known(static_argnums=(2, 3, 4))
 def _of_grid(
-    xp: Any,
-    tensors: Any,
-    domain: Any,
-    spacing: Any,
-    periodic: tuple[bool, ...],
-    interpolation: Interpolation,
-    lumped: bool,
-    cancelling: bool,
-    fick: bool,
+    xp: Any, metric: SampledMetric, domain: Any, periodic: tuple[bool, ...], lumped: bool, cancelling: bool
 ) -> tuple[Any, ...]:
-    tensors = xp.where(domain[..., None, None], tensors, xp.eye(tensors.shape[-1], dtype=tensors.dtype))
-    along = [spacing[a] ** 2 * tensors[..., a, a] for a in range(tensors.shape[-1])]
-    turning = _turning(xp, tensors, domain, periodic, fick)
-    measured = spd.inverse(tensors) if fick else tensors
-    swelling, unevenness = _swelling(xp, measured, domain, periodic, interpolation)
-    if fick:
+    d, dtype, spacing = metric.tensors.shape[-1], metric.tensors.dtype, metric.spacing
+    assert spacing is not None
+    tensors = xp.where(domain[..., None, None], metric.tensors, xp.eye(d, dtype=dtype))
+    along = [spacing[a] ** 2 * tensors[..., a, a] for a in range(d)]
+    turning = _turning(xp, tensors, domain, periodic, metric.fick)
+    measured = spd.inverse(tensors) if metric.fick else tensors
+    swelling, unevenness = _swelling(xp, measured, domain, periodic, metric.interpolation)
+    if metric.fick:
         # Fick's volume element is exact. An error of √|D| is one of the eigenvalues to the power d/2, and so of the
         # signature, proportional to λ^(d/2) at small times.
         turning, swelling, unevenness = turning + swelling, xp.zeros_like(swelling), xp.zeros_like(unevenness)

@@ -62,6 +62,7 @@ class Identifiability(eqx.Module):
 def identifiability(
     fit: MetricFit | Problem,
     values: Values | None = None,
+    *,
     n: int = 32,
     n_weak: int = 4,
     noise: float = 0.01,

@@ -60,8 +60,8 @@ def _read_tensors(
 
 def volume_of(name: str, arrays: Mapping[str, Any], tensors: Float[np.ndarray, "..."], **about: Any) -> TensorVolume:
     """Return a volume of `tensors` with the arrays of `place_of`; by default, spacing is 1 and origin is 0."""
-    mask, affine, d = arrays.get("mask"), arrays.get("affine"), tensors.shape[-1] if tensors.ndim else 0
-    axis = arrays.get("slice_axis")
+    mask, affine, axis = (arrays.get(name) for name in ("mask", "affine", "slice_axis"))
+    d = tensors.shape[-1] if tensors.ndim else 0
     return TensorVolume(
         tensors,
         per_axis(f"{name}: spacing", arrays.get("spacing", 1.0), d),

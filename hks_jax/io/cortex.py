@@ -16,26 +16,19 @@ from jaxtyping import Float
 
 from hks_jax.io.mesh_formats import Loaded
 from hks_jax.optional import optional
-from hks_jax.storage import atomic_path, content_of, reading
+from hks_jax.storage import UnsuitedError, atomic_path, content_of, reading
 
 MAPS = ".func.gii"
 """The suffix of maps in GIFTI; Workbench knows the kind of the content by it."""
-_TRIANGLES = b"\xff\xff\xfe"
+TRIANGLES = b"\xff\xff\xfe"
 """The first bytes of FreeSurfer's files of triangles."""
 _VALUES = b"\xff\xff\xff"
 """The first bytes of FreeSurfer's files of one number for each vertex: lh.thickness, lh.curv, lh.sulc and others."""
-_STRUCTURE = "AnatomicalStructurePrimary"
+STRUCTURE = "AnatomicalStructurePrimary"
+"""The entry of GIFTI's metadata that names the structure of a surface, such as CortexLeft. Workbench asks for it."""
 _GEOMETRY = ("NIFTI_INTENT_POINTSET", "NIFTI_INTENT_TRIANGLE")
 _AXES = 6
 """The largest number of axes that GIFTI allows for an array."""
-
-
-def is_freesurfer(path: Path, of_maps: bool = False) -> bool:
-    """Return whether a file begins with the first bytes of FreeSurfer's surfaces, or of its maps."""
-    if not path.is_file():
-        return False
-    with open(path, "rb") as stream:
-        return stream.read(3) == (_VALUES if of_maps else _TRIANGLES)
 
 
 _OWN_AXES = np.array([[-1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
@@ -46,18 +39,16 @@ _SCANNER = (1, 2)
 
 def load_freesurfer(path: Path, in_space: bool = False) -> Loaded:
     """Load a FreeSurfer surface with the coordinates in the file or, if `in_space`, with scanner coordinates, in mm."""
-    library = optional("nibabel")
-    with reading(path, "a readable FreeSurfer surface"):
-        content = path.read_bytes()
-        # The numbers of vertices and triangles follow two lines that contain a magic number and a comment.
-        start = content.index(b"\n", content.index(b"\n", len(_TRIANGLES)) + 1) + 1
-        n_vertices, n_faces = np.frombuffer(content[start : start + 8], ">i4").tolist()
-        end = start + 8 + 12 * (n_vertices + n_faces)
-        if min(n_vertices, n_faces) < 0 or end > len(content):
-            raise ValueError(
-                f"got {len(content)} bytes; expected {end} for the declared {n_vertices} vertices, {n_faces} triangles"
-            )
-        vertices, faces = library.freesurfer.read_geometry(path)
+    library, content = optional("nibabel"), path.read_bytes()
+    # The numbers of vertices and triangles follow two lines that contain a magic number and a comment.
+    start = content.index(b"\n", content.index(b"\n", len(TRIANGLES)) + 1) + 1
+    n_vertices, n_faces = np.frombuffer(content[start : start + 8], ">i4").tolist()
+    end = start + 8 + 12 * (n_vertices + n_faces)
+    if min(n_vertices, n_faces) < 0 or end > len(content):
+        raise ValueError(
+            f"got {len(content)} bytes; expected {end} for the declared {n_vertices} vertices, {n_faces} triangles"
+        )
+    vertices, faces = library.freesurfer.read_geometry(path)
     vertices = np.asarray(vertices, np.float64)
     if in_space and content[end : end + 8] != b"\0\0\0\2\0\0\0\1":  # this tag marks scanner coordinates
         told = {
@@ -65,15 +56,16 @@ def load_freesurfer(path: Path, in_space: bool = False) -> Loaded:
             for name, numbers in re.findall(rb"([xyzc]ras)\s*=([-+.\deE \t]+)", content[end:])
         }
         axes = [told.get(name + b"ras", np.zeros(0)) for name in (b"x", b"y", b"z", b"c")]
-        vertices = _from_own_axes(path, vertices, axes)
-    return Loaded(vertices, np.asarray(faces, np.int64))
+        vertices = _from_own_axes(vertices, axes)
+    side = {"lh.": "CortexLeft", "rh.": "CortexRight"}.get(path.name[:3], "")
+    return Loaded(vertices, np.asarray(faces, np.int64), structure=side)
 
 
-def _from_own_axes(path: Path, vertices: np.ndarray, axes: list[np.ndarray]) -> np.ndarray:
+def _from_own_axes(vertices: np.ndarray, axes: list[np.ndarray]) -> np.ndarray:
     """Transform FreeSurfer's surface coordinates to scanner coordinates; `axes` has the volume's axes and centre."""
     if any(axis.shape != (3,) or not np.isfinite(axis).all() for axis in axes):
-        raise ValueError(
-            f"{path}: the file does not state the position of its volume (x_ras … c_ras), which scanner coordinates "
+        raise UnsuitedError(
+            "the file does not state the position of its volume (x_ras … c_ras), which scanner coordinates "
             "need. Convert the file by mris_convert --to-scanner"
         )
     return vertices @ (np.stack(axes[:3], axis=1) @ _OWN_AXES.T).T + axes[3]
@@ -81,32 +73,30 @@ def _from_own_axes(path: Path, vertices: np.ndarray, axes: list[np.ndarray]) -> 
 
 def load_gifti(path: Path, in_space: bool = False) -> Loaded:
     """Load a GIFTI surface with the coordinates in the file or, if `in_space`, with scanner coordinates."""
-    library = optional("nibabel")
-    with reading(path, "a readable GIFTI surface"):
-        content = content_of(path)
-        # nibabel would loop over any declared number of axes, such as a billion.
-        axes = [int(n) for n in re.findall(rb"Dimensionality\s*=\s*[\"'](\d+)", content)]
-        if max(axes, default=0) > _AXES:
-            raise ValueError(f"got an array of {max(axes)} axes; expected at most {_AXES}")
-        image = library.gifti.GiftiImage.from_bytes(content)
-        arrays_of_kinds = [image.get_arrays_from_intent(f"NIFTI_INTENT_{kind}") for kind in ("POINTSET", "TRIANGLE")]
-        if not all(arrays_of_kinds):
-            numbers = " and ".join(str(len(arrays)) for arrays in arrays_of_kinds)
-            raise ValueError(f"got {numbers} arrays of points and of triangles; expected one of each")
+    library, content = optional("nibabel"), content_of(path)
+    # nibabel would loop over any declared number of axes, such as a billion.
+    axes = [int(n) for n in re.findall(rb"Dimensionality\s*=\s*[\"'](\d+)", content)]
+    if max(axes, default=0) > _AXES:
+        raise ValueError(f"got an array of {max(axes)} axes; expected at most {_AXES}")
+    image = library.gifti.GiftiImage.from_bytes(content)
+    arrays_of_kinds = [image.get_arrays_from_intent(f"NIFTI_INTENT_{kind}") for kind in ("POINTSET", "TRIANGLE")]
+    if not all(arrays_of_kinds):
+        numbers = " and ".join(str(len(arrays)) for arrays in arrays_of_kinds)
+        raise ValueError(f"got {numbers} arrays of points and of triangles; expected one of each")
     for kind, arrays in zip(("sets of points", "sets of triangles"), arrays_of_kinds, strict=True):
         if len(arrays) > 1:
             named = ", ".join(_name(array) or f"number {i} without a name" for i, array in enumerate(arrays, 1))
-            raise ValueError(
-                f"{path}: got {len(arrays)} {kind} ({named}); expected one. Write each surface to a file of its own"
+            raise UnsuitedError(
+                f"got {len(arrays)} {kind} ({named}); expected one. Write each surface to a file of its own"
             )
-    with reading(path, "a readable GIFTI surface"):
-        vertices, faces = (np.asarray(arrays[0].data) for arrays in arrays_of_kinds)
-        if vertices.ndim != 2 or faces.ndim != 2 or faces.dtype.kind not in "iu":
-            raise ValueError(f"got shapes {vertices.shape}, {faces.shape} ({faces.dtype}); expected (V, 3), (n, 3)")
-    vertices = vertices.astype(np.float64)
+    vertices, faces = (np.asarray(arrays[0].data) for arrays in arrays_of_kinds)
+    if vertices.ndim != 2 or faces.ndim != 2 or faces.dtype.kind not in "iu":
+        raise ValueError(f"got shapes {vertices.shape}, {faces.shape} ({faces.dtype}); expected (V, 3), (n, 3)")
+    points, vertices = arrays_of_kinds[0][0], vertices.astype(np.float64)
     if in_space:
-        vertices = _in_space(path, vertices, arrays_of_kinds[0][0])
-    return Loaded(vertices, faces.astype(np.int64))
+        vertices = _in_space(vertices, points)
+    named = next((meta[STRUCTURE] for meta in (image.meta, points.meta) if meta.get(STRUCTURE)), "")
+    return Loaded(vertices, faces.astype(np.int64), structure=str(named))
 
 
 def _name(array: Any) -> str:
@@ -118,7 +108,7 @@ def _name(array: Any) -> str:
 
 # Workbench declares the coordinates of every file as coordinates of an atlas. Coordinates in an atlas or in an unknown
 # space stay unchanged, unless FreeSurfer wrote the file in its surface coordinates.
-def _in_space(path: Path, vertices: np.ndarray, points: Any) -> np.ndarray:
+def _in_space(vertices: np.ndarray, points: Any) -> np.ndarray:
     """Return scanner coordinates, by the transformation in the file or by the position of FreeSurfer's volume."""
     system, told = points.coordsys, dict(points.meta)
     if system is not None and system.dataspace in _SCANNER:
@@ -129,7 +119,7 @@ def _in_space(path: Path, vertices: np.ndarray, points: Any) -> np.ndarray:
     if "VolGeomC_R" not in told:
         return vertices
     axes = [np.array([float(told.get(f"VolGeom{a}_{b}", "nan")) for b in "RAS"]) for a in "XYZC"]
-    return _from_own_axes(path, vertices, axes)
+    return _from_own_axes(vertices, axes)
 
 
 def load_maps(path: Path) -> list[Float[np.ndarray, "..."]] | None:
@@ -140,25 +130,13 @@ def load_maps(path: Path) -> list[Float[np.ndarray, "..."]] | None:
         with reading(path, "a readable GIFTI file"):
             arrays = library.load(path).darrays
             return [np.asarray(array.data) for array in arrays if names[array.intent] not in _GEOMETRY]
-    if is_freesurfer(path, of_maps=True):
+    with open(path, "rb") as stream:
+        is_freesurfer = stream.read(len(_VALUES)) == _VALUES
+    if is_freesurfer:
         library = optional("nibabel")
         with reading(path, "a readable FreeSurfer map"):
             return [np.asarray(library.freesurfer.read_morph_data(path))]
     return None
-
-
-def structure_of(path: Path) -> dict[str, str]:
-    """Return the entry of GIFTI's metadata that names a surface's structure, such as CortexLeft, if it is known.
-
-    GIFTI surfaces contain it, and the names of FreeSurfer's surfaces tell it. Workbench asks for it if a file lacks it.
-    """
-    if is_freesurfer(path):
-        found = {"lh.": "CortexLeft", "rh.": "CortexRight"}.get(path.name[:3])
-    else:
-        image = optional("nibabel").gifti.GiftiImage.from_bytes(content_of(path))
-        metas = [image.meta, *(points.meta for points in image.get_arrays_from_intent("NIFTI_INTENT_POINTSET"))]
-        found = next((meta[_STRUCTURE] for meta in metas if meta.get(_STRUCTURE)), None)
-    return {} if found is None else {_STRUCTURE: str(found)}
 
 
 def write_maps(path: Path, arrays: Mapping[str, Float[np.ndarray, " V"]], record: str) -> None:
@@ -174,7 +152,7 @@ def write_maps(path: Path, arrays: Mapping[str, Float[np.ndarray, " V"]], record
         return gifti.GiftiDataArray(np.asarray(values, np.float32), *kind, meta=meta)
 
     arrays_of_image = [array_of(name, values) for name, values in arrays.items()]
-    structure = {name: value for name, value in json.loads(record).items() if name == _STRUCTURE}
+    structure = {name: value for name, value in json.loads(record).items() if name == STRUCTURE}
     meta = gifti.GiftiMetaData({"provenance": record, **structure})
     image = gifti.GiftiImage(darrays=arrays_of_image, meta=meta)
     with atomic_path(path) as temporary:

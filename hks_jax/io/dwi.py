@@ -19,7 +19,7 @@ from hks_jax.io.units import MM2_PER_S, UNITS, Unit, b_value_question, median_me
 from hks_jax.io.volume import TensorVolume, digest, placed
 from hks_jax.naming import argument
 from hks_jax.optional import optional
-from hks_jax.storage import existing, reading
+from hks_jax.storage import reading
 
 _LENGTH = 0.05
 """The largest difference of a direction's length from 1 that is attributed to rounding."""
@@ -129,7 +129,7 @@ def fit_dwi(
         [0.001 0.001 0.001]
     """
     name, table = os.fspath(path), f"{os.fspath(bval)}, {os.fspath(bvec)}"
-    image = nifti.load(name)
+    image, voxels = nifti.load(name)
     affine, _ = nifti.affine_in_mm(name, image)
     b, directions = np.atleast_1d(_numbers(bval).squeeze()), np.atleast_2d(_numbers(bvec, may_be_nan=True))
     if directions.shape[-1] != 3 or directions.shape == (3, 3) != (b.size, 3):
@@ -158,7 +158,7 @@ def fit_dwi(
             f"unknowns; expected at least {_UNKNOWNS + 1} images, and 15 for an estimate with an error of 25 %. Give "
             "the standard deviation of the noise as a number"
         )
-    signal = nifti.voxels(name, image)[..., used]
+    signal = voxels[..., used]
     inside, found = _inside(name, mask, signal, design, b, images, _UNKNOWNS + (noise == "residuals"), affine)
     data = signal[inside].astype(np.float64)
     tensors, pieces = np.zeros((*inside.shape, 3, 3)), []
@@ -424,8 +424,7 @@ def _inside(
 
 
 def _numbers(path: str | os.PathLike[str], *, may_be_nan: bool = False) -> Float[np.ndarray, "..."]:
-    file = existing(path)
-    with reading(file, "a table of numbers"), warnings.catch_warnings():
+    with reading(path, "a table of numbers") as file, warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # NumPy warns if a table is empty
         numbers = np.loadtxt(file, dtype=np.float64, encoding="utf-8-sig")
         if not numbers.size or not (may_be_nan or np.isfinite(numbers).all()):

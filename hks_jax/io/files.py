@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hks_jax.checks import require_number, require_real
-from hks_jax.domain.simplices import WORDS
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.io import mesh, nifti
 from hks_jax.io.formats import WRITTEN, format_of
@@ -24,8 +23,7 @@ from hks_jax.io.tables import write_json
 from hks_jax.io.tensor_order import Frame, Order
 from hks_jax.io.units import Unit
 from hks_jax.io.volume import TensorVolume, describe, digest
-from hks_jax.io.vtk_image import by_time
-from hks_jax.storage import atomic_path, write_npz
+from hks_jax.storage import atomic_path
 
 _NAME = re.compile(r"[A-Za-z0-9_.-]+")
 """The names of arrays that all formats can hold: PLY has no spaces, Gmsh no quotation marks, VTU no "<"."""
@@ -182,47 +180,37 @@ def save(
     n = array.ndim - len(shape)
     if n not in (0, 1) or array.shape[n:] != shape:
         raise ValueError(f"values: got shape {array.shape}; expected {shape}, or (n_times, *shape)")
-    extra = dict(extra or {})
-    if file.suffix.lower() == ".pvd":
-        _save_series(file, array, volume, name, extra, provenance)
-    elif not isinstance(volume, SimplicialMesh):
-        write = format_of(file, WRITTEN).write
-        assert write is not None
-        write(file, array, volume, name, extra, describe(volume, provenance))
-    elif file.name.lower().endswith(".npz"):
-        cells = {WORDS[volume.triangulation.dimension].argument: volume.triangulation.cells}
-        place = {"vertices": np.asarray(volume.vertices), **cells}
-        write_npz(file, {name: array, **place, **extra, "provenance": describe(None, provenance)})
+    record = describe(None if isinstance(volume, SimplicialMesh) else volume, provenance)
+    parts: list[tuple[Path, np.ndarray, dict[str, Any], str]]
+    series, times = file.suffix.lower() == ".pvd", np.ravel((extra or {}).get("times", ()))
+    if series:
+        if n != 1 or len(times) != len(array):
+            raise ValueError(
+                f"extra: got {len(times)} times for values of shape {array.shape}; expected values (n_times, *shape) "
+                'and extra={"times": …} with n_times numbers, as a time series has'
+            )
+        suffix, of_part = (".vtu", "") if isinstance(volume, SimplicialMesh) else (".vti", record)
+        parts = [(file.with_name(f"{file.stem}.{i}{suffix}"), each, {}, of_part) for i, each in enumerate(array)]
     else:
-        mesh.write(file, by_time(name, array, n, extra), volume, describe(None, provenance))
+        parts = [(file, array, dict(extra or {}), record)]
+    for part, of_array, more, about in parts:
+        if isinstance(volume, SimplicialMesh):
+            mesh.write(part, of_array, volume, name, more, about)
+        else:
+            write = format_of(part, WRITTEN).write
+            assert write is not None
+            write(part, of_array, volume, name, more, about)
+    if series:
+        _write_collection(file, times, [part.name for part, *_ in parts], record)
     return file
 
 
-def _save_series(
-    path: Path,
-    array: np.ndarray,
-    place: TensorVolume | SimplicialMesh,
-    name: str,
-    extra: Mapping[str, Any],
-    provenance: Mapping[str, Any] | None,
-) -> None:
-    """Write one VTK file for each time, and the collection of them."""
-    times = np.ravel(extra.get("times", ()))
-    if array.ndim != 1 + (1 if isinstance(place, SimplicialMesh) else place.dimension) or len(times) != len(array):
-        raise ValueError(
-            f"extra: got {len(times)} times for values of shape {array.shape}; expected values (n_times, *shape) and "
-            'extra={"times": …} with n_times numbers, as a time series has'
-        )
+def _write_collection(path: Path, times: Float[np.ndarray, " n_times"], parts: Sequence[str], record: str) -> None:
+    """Write the list of the files of a time series, and a record of their origin."""
     collection = ElementTree.Element("VTKFile", type="Collection", version="0.1")
     entries = ElementTree.SubElement(collection, "Collection")
-    record = describe(None if isinstance(place, SimplicialMesh) else place, provenance)
-    for i, (time, values) in enumerate(zip(times.tolist(), array, strict=True)):
-        part = path.with_name(f"{path.stem}.{i}{'.vtu' if isinstance(place, SimplicialMesh) else '.vti'}")
-        if isinstance(place, SimplicialMesh):
-            mesh.write(part, {name: values}, place)
-        else:
-            save(part, values, place, name=name, provenance=provenance)
-        ElementTree.SubElement(entries, "DataSet", timestep=repr(time), part="0", file=part.name)
+    for time, part in zip(times.tolist(), parts, strict=True):
+        ElementTree.SubElement(entries, "DataSet", timestep=repr(time), part="0", file=part)
     with atomic_path(path) as temporary:
         ElementTree.ElementTree(collection).write(temporary, encoding="utf-8", xml_declaration=True)
     write_json(path.with_name(f"{path.name}.json"), json.loads(record))

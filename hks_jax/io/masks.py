@@ -15,7 +15,7 @@ from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.io.formats import IMAGES, format_of
 from hks_jax.io.tables import read_table
 from hks_jax.io.volume import TensorVolume, corners, mask_in_file, require_position
-from hks_jax.storage import existing, reading
+from hks_jax.storage import reading
 
 
 def read_mask(path: str | os.PathLike[str], affine: np.ndarray | None = None) -> Bool[np.ndarray, "*shape"]:
@@ -104,8 +104,7 @@ def read_names(path: str | os.PathLike[str]) -> dict[int, str]:
     A line of FreeSurfer's table has a number, a name and four numbers of a colour. Further tab-separated columns are
     ignored.
     """
-    file = existing(path)
-    with reading(file, "a text in UTF-8"):
+    with reading(path, "a text in UTF-8") as file:
         lines = [line.strip("\r\n") for line in file.read_text(encoding="utf-8-sig").splitlines()]
     if lines and {"index", "name"} <= set(lines[0].split("\t")):
         rows = [(row.get("index", ""), row.get("name", "")) for row in read_table(file)]

@@ -3,8 +3,9 @@
 import json
 import os
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -20,10 +21,10 @@ from hks_jax.io import cortex
 from hks_jax.io.mesh_formats import Loaded, load_obj, load_off, polygonal, through_meshio
 from hks_jax.io.ply import load_ply
 from hks_jax.io.tables import write_json
-from hks_jax.io.vtk_image import holds_dataset
+from hks_jax.io.vtk_image import by_time
 from hks_jax.naming import argument
 from hks_jax.optional import optional
-from hks_jax.storage import atomic_path, existing
+from hks_jax.storage import UnsuitedError, atomic_path, reading, write_npz
 
 READ = (".vtk", ".vtu", ".vtp", ".msh", ".ply", ".stl", ".obj", ".off", ".gii", ".gii.gz")
 """The suffixes of meshes. FreeSurfer's surfaces have no suffix and are recognised by their first bytes."""
@@ -71,7 +72,22 @@ def read_mesh(path: str | os.PathLike[str], *, clean: bool = False, in_space: bo
         >>> np.allclose(hj.io.read_mesh(path).vertices, sphere.vertices, atol=1e-6)
         True
     """
+    return load_mesh(path, clean, in_space).mesh
+
+
+class MeshInFile(NamedTuple):
+    """A mesh with the arrays of its file, by their place (``"vertices"``, and ``"faces"`` or ``"cells"``) and name."""
+
+    mesh: SurfaceMesh | TetMesh
+    arrays: dict[str, dict[str, Float[np.ndarray, "n *components"]]]
+    written: tuple[str, ...]  # the suffixes of results on the mesh
+    origin: dict[str, str]  # entries of their provenance
+
+
+def load_mesh(path: str | os.PathLike[str], clean: bool = False, in_space: bool = False) -> MeshInFile:
+    """Read a mesh and its arrays; see `read_mesh`."""
     loaded, said = _load(path, clean, in_space)
+    maps = is_surface(Path(path)) and not clean  # cleaning may have renumbered the vertices
     make: Callable[..., SurfaceMesh | TetMesh] = SurfaceMesh if loaded.cells.shape[1] == 3 else TetMesh
     remedy = "" if clean else f". {argument('clean', True)} repairs some defects"
     try:
@@ -82,7 +98,11 @@ def read_mesh(path: str | os.PathLike[str], *, clean: bool = False, in_space: bo
         raise ValueError(f"{os.fspath(path)}: {error}{remedy}") from error
     if said:
         warn_of_accuracy(f"{os.fspath(path)}: {said}{remedy}", UserWarning if clean else AccuracyWarning)
-    return mesh
+    suffix = Path(path).suffix.lower()
+    if suffix not in WRITTEN or (suffix == ".ply" and isinstance(mesh, TetMesh)):
+        suffix = ".vtu"  # the file's format has no values at vertices
+    origin = {cortex.STRUCTURE: loaded.structure} if maps and loaded.structure else {}
+    return MeshInFile(mesh, _by_place(loaded), (suffix, cortex.MAPS) if maps else (suffix,), origin)
 
 
 def read_mesh_arrays(
@@ -115,44 +135,70 @@ def read_mesh_arrays(
         >>> np.allclose(hj.io.read_mesh_arrays(path)["height"], sphere.vertices[:, 2], atol=1e-6)
         True
     """
-    arrays = arrays_by_place(path, clean)
+    arrays = _by_place(_load(path, clean)[0])
     if at not in arrays:
         raise ValueError(f"at: got {at!r}, but the places of arrays in {os.fspath(path)} are {', '.join(arrays)}")
     return arrays[at]
 
 
-def arrays_by_place(path: str | os.PathLike[str], clean: bool = False) -> dict[str, dict[str, np.ndarray]]:
+def _by_place(loaded: Loaded) -> dict[str, dict[str, np.ndarray]]:
     """Return the arrays at the ``"vertices"``, and at the ``"faces"`` of a surface or the ``"cells"`` of a solid."""
-    loaded = _load(path, clean)[0]
     return {"vertices": dict(loaded.arrays), WORDS[loaded.cells.shape[1] - 1].argument: dict(loaded.of_cells)}
 
 
 def is_mesh(path: Path) -> bool:
     """Return whether `read_mesh` reads a file, judged by the suffix or, without one, by the first bytes."""
-    name = path.name.lower()
-    if name.endswith(".vtk"):
-        return path.is_file() and not holds_dataset(path, "STRUCTURED_POINTS")
-    return name.endswith(READ) or cortex.is_freesurfer(path)
+    kind = _kind_of(path)
+    return kind != "" and (kind != ".vtk" or (path.is_file() and b"STRUCTURED_POINTS" not in _head(path).upper()))
 
 
 def is_surface(path: Path) -> bool:
     """Return whether a mesh is a GIFTI or a FreeSurfer surface, to which a file of maps belongs."""
-    return path.name.lower().endswith((".gii", ".gii.gz")) or cortex.is_freesurfer(path)
+    return _kind_of(path) in (".gii", _FREESURFER)
 
 
-def write(path: Path, arrays: Mapping[str, Float[np.ndarray, " V"]], mesh: SimplicialMesh, record: str = "") -> None:
+_FREESURFER = "FreeSurfer"
+
+
+def _kind_of(path: Path) -> str:
+    """Return the suffix of a mesh's format (``.vtp`` for polygonal data in ``.vtk``), `_FREESURFER`, or nothing."""
+    name = path.name.lower()
+    found = next((suffix for suffix in READ if name.endswith(suffix)), "")
+    if found == ".vtk" and b"POLYDATA" in _head(path).upper():
+        return ".vtp"
+    if not found and _head(path).startswith(cortex.TRIANGLES):
+        return _FREESURFER
+    return found.removesuffix(".gz")
+
+
+def _head(path: Path) -> bytes:
+    """Return the beginning of a FreeSurfer surface or of a legacy VTK file; nothing for other files."""
+    if not path.is_file():
+        return b""
+    with open(path, "rb") as stream:
+        head = stream.read(1024)
+    return head if head.startswith((cortex.TRIANGLES, b"# vtk DataFile")) else b""
+
+
+def write(
+    path: Path, array: Float[np.ndarray, "*n V"], mesh: SimplicialMesh, name: str, extra: Mapping[str, Any], record: str
+) -> None:
     """Write a mesh with values at its vertices, and a record of their origin, if any, to the file ``path.json``.
 
-    A GIFTI file has the values and the record, and no mesh.
+    An npz file also has the arrays in `extra`. A GIFTI file has the values and no mesh. Both have the record.
     """
-    suffix, solid = path.suffix.lower(), mesh.triangulation.dimension == 3
+    suffix, dimension = path.suffix.lower(), mesh.triangulation.dimension
+    if suffix == ".npz":
+        place = {"vertices": np.asarray(mesh.vertices), WORDS[dimension].argument: mesh.triangulation.cells}
+        return write_npz(path, {name: array, **place, **extra, "provenance": record})
+    arrays, solid = by_time(name, array, array.ndim - 1, extra), dimension == 3
     if suffix == ".gii" and not solid:
         return cortex.write_maps(path, arrays, record)
     allowed = [s for s in (*WRITTEN, ".gii") if not (solid and s in (".ply", ".gii"))]
     if suffix not in allowed:
         what = "values at the vertices of tetrahedra" if solid else "values at vertices"
         raise ValueError(f"path: got {str(path)!r}; {what} can be written as {', '.join(allowed)} or .npz")
-    if reserved := [name for name in arrays if name in _RESERVED.get(suffix, ())]:
+    if reserved := [key for key in arrays if key in _RESERVED.get(suffix, ())]:
         raise ValueError(f"name: got {reserved[0]!r}, which has another meaning in {suffix}; choose another name")
     library = optional("meshio")
     cells = [("tetra" if solid else "triangle", mesh.triangulation.cells.astype(np.int32))]  # PLY has no int64
@@ -164,25 +210,25 @@ def write(path: Path, arrays: Mapping[str, Float[np.ndarray, " V"]], mesh: Simpl
 
 
 def _load(path: str | os.PathLike[str], clean: bool, in_space: bool = False) -> tuple[Loaded, str]:
-    file = existing(path)
-    name = file.name.lower()
-    if name.endswith((".gii", ".gii.gz")):
-        loaded = cortex.load_gifti(file, in_space)
-    elif name.endswith(".vtp") or (name.endswith(".vtk") and holds_dataset(file, "POLYDATA")):
-        loaded = polygonal(file)
-    elif name.endswith(".obj"):
-        loaded = load_obj(file)
-    elif name.endswith(".off"):
-        loaded = load_off(file)
-    elif name.endswith(".ply"):
-        loaded = load_ply(file)
-    elif name.endswith(READ):
-        loaded = through_meshio(file)
-    elif cortex.is_freesurfer(file):
-        loaded = cortex.load_freesurfer(file, in_space)
-    else:
-        raise ValueError(f"{file}: the kind of mesh is unknown; expected {', '.join(READ)}, or a FreeSurfer surface")
+    """Return the content of a file, and a text that lists what cleaning changed."""
+    readers: dict[str, tuple[str, Callable[[Path], Loaded]]] = {
+        ".gii": ("a readable GIFTI surface", partial(cortex.load_gifti, in_space=in_space)),
+        ".vtp": ("readable polygonal data", polygonal),
+        ".obj": ("a readable OBJ mesh", load_obj),
+        ".off": ("a readable OFF mesh", load_off),
+        ".ply": ("a readable PLY mesh", load_ply),
+        _FREESURFER: ("a readable FreeSurfer surface", partial(cortex.load_freesurfer, in_space=in_space)),
+        "": ("a readable mesh", _unknown),
+    }
+    kind = _kind_of(Path(path))
+    words, load = readers.get(kind, (f"a mesh that meshio can read as {kind}", through_meshio))
+    with reading(path, words) as file:
+        loaded = load(file)
     return _cleaned(loaded) if clean else (loaded, "")
+
+
+def _unknown(path: Path) -> Loaded:
+    raise UnsuitedError(f"the kind of mesh is unknown; expected {', '.join(READ)}, or a FreeSurfer surface")
 
 
 def _same_places(vertices: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, " V"]:
@@ -256,7 +302,8 @@ def _cleaned(loaded: Loaded) -> tuple[Loaded, str]:
     say(int((finite & (first == np.arange(len(first)))).sum()) - len(used), f"vertices without a {words.one} removed")
     arrays = {name: values[used] for name, values in loaded.arrays.items()}
     of_cells = {name: values[kept] for name, values in loaded.of_cells.items()}
-    return Loaded(loaded.vertices[used], numbered.reshape(cells.shape), arrays, of_cells), "; ".join(done)
+    cleaned = Loaded(loaded.vertices[used], numbered.reshape(cells.shape), arrays, of_cells, loaded.structure)
+    return cleaned, "; ".join(done)
 
 
 def _without_thin(

@@ -20,7 +20,7 @@ from jaxtyping import Float, Int
 from hks_jax.io import gmsh
 from hks_jax.io.vtk_image import load as through_vtk
 from hks_jax.optional import optional
-from hks_jax.storage import reading
+from hks_jax.storage import UnsuitedError
 
 
 class Loaded(NamedTuple):
@@ -30,48 +30,44 @@ class Loaded(NamedTuple):
     cells: Int[np.ndarray, "n corners"]
     arrays: Mapping[str, Float[np.ndarray, "V *components"]] = MappingProxyType({})
     of_cells: Mapping[str, Float[np.ndarray, "n *components"]] = MappingProxyType({})
+    structure: str = ""  # of a brain's surface, in the terms of GIFTI, such as CortexLeft; empty if it is not known
 
 
 def through_meshio(path: Path) -> Loaded:
-    """Load triangles or tetrahedra through meshio; raise ValueError for other cells and damaged files."""
-    suffix = path.suffix.lower()
+    """Load triangles or tetrahedra through meshio."""
+    suffix, content = path.suffix.lower(), path.read_bytes()
     library = optional("meshio")
-    if suffix == ".vtu" and (
-        found := re.search(rb"<VTKFile[^>]*\bcompressor\s*=\s*[\"'](vtkLZ4\w*)", path.read_bytes())
-    ):
-        raise ValueError(
-            f"{path}: the data are compressed by {found[1].decode()}, which meshio does not read. Write the file with "
+    if suffix == ".vtu" and (found := re.search(rb"<VTKFile[^>]*\bcompressor\s*=\s*[\"'](vtkLZ4\w*)", content)):
+        raise UnsuitedError(
+            f"the data are compressed by {found[1].decode()}, which meshio does not read. Write the file with "
             "zlib compression (vtkZLibDataCompressor) or without compression"
         )
+    declared = _declared(content, suffix)
+    pieces = _pieces(content) if suffix == ".vtu" else []
     # meshio computes the length of a binary STL file from its number of triangles, which overflows for STL text.
-    with reading(path, f"a mesh that meshio can read as {suffix}"), np.errstate(over="ignore"):
-        content = path.read_bytes()
-        declared = _declared(content, suffix)
-        pieces = _pieces(content) if suffix == ".vtu" else []
+    with np.errstate(over="ignore"):
         if suffix == ".msh":
             read = _gmsh(library, content)
         else:
             read = _joined(library, content, pieces) if len(pieces) > 1 else _read(library, content, suffix)
-        _compare(content, suffix, declared, read)
-        points = np.asarray(read.points, np.float64)
-        blocks = [block.data for block in read.cells if block.type == "tetra"]
-        if any(cells.shape[1:] != (4,) for cells in blocks):
-            raise ValueError(f"got tetrahedra of shape {blocks[0].shape}; expected (n, 4)")
-        if points.ndim != 2 or points.shape[1] not in (2, 3):
-            raise ValueError(f"got points of shape {points.shape}; expected (V, 2) or (V, 3)")
-        points = np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
-        arrays = real_arrays(read.point_data, len(points))
-        which = [i for i, block in enumerate(read.cells) if block.type == "tetra"]
-        which = which or [i for i, block in enumerate(read.cells) if block.type in ("triangle", "quad")]
-        of_blocks = {name: [np.asarray(parts[i]) for i in which] for name, parts in read.cell_data.items()}
+    _compare(content, suffix, declared, read)
+    points = np.asarray(read.points, np.float64)
+    blocks = [block.data for block in read.cells if block.type == "tetra"]
+    if any(cells.shape[1:] != (4,) for cells in blocks):
+        raise ValueError(f"got tetrahedra of shape {blocks[0].shape}; expected (n, 4)")
+    if points.ndim != 2 or points.shape[1] not in (2, 3):
+        raise ValueError(f"got points of shape {points.shape}; expected (V, 2) or (V, 3)")
+    points = np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
+    arrays = real_arrays(read.point_data, len(points))
+    which = [i for i, block in enumerate(read.cells) if block.type == "tetra"]
+    which = which or [i for i, block in enumerate(read.cells) if block.type in ("triangle", "quad")]
+    of_blocks = {name: [np.asarray(parts[i]) for i in which] for name, parts in read.cell_data.items()}
     others = {block.type for block in read.cells} - {"tetra", "triangle", "quad", "line", "vertex"}
     if others:
-        raise ValueError(
-            f"{path}: got {', '.join(sorted(others))} cells; expected triangles, quadrilaterals or tetrahedra"
-        )
+        raise UnsuitedError(f"got {', '.join(sorted(others))} cells; expected triangles, quadrilaterals or tetrahedra")
     if not which:
-        raise ValueError(f"{path}: the mesh has no triangles and no tetrahedra; expected one of these kinds of cell")
-    parts = blocks or [fans(path, points, read.cells[i].data) for i in which]
+        raise UnsuitedError("the mesh has no triangles and no tetrahedra; expected one of these kinds of cell")
+    parts = blocks or [fans(points, read.cells[i].data) for i in which]
     times = [1 if blocks else each.shape[1] for each in parts]  # a quadrilateral becomes two triangles
     cells = np.concatenate([each.reshape(-1, 4 if blocks else 3) for each in parts]).astype(np.int64)
     of_cells = {
@@ -188,16 +184,15 @@ def _compare(content: bytes, suffix: str, declared: tuple[int, ...], mesh: Any) 
 
 def polygonal(path: Path) -> Loaded:
     """Load polygonal data through VTK, with polygons cut into triangles."""
-    with reading(path, "readable polygonal data"):
-        data = through_vtk(path)
-        if "faces" not in data:
-            raise ValueError(f"got {data['kind']}; expected vtkPolyData")
-        points, faces = data["points"].astype(np.float64), data["faces"].astype(np.int64)
-        at_points, at_cells = (
-            {key.removeprefix(place): values for key, values in data.items() if key.startswith(place)}
-            for place in ("point:", "cell:")
-        )
-        of_faces = {name: values[data["cells_of_faces"]] for name, values in at_cells.items()}
+    data = through_vtk(path)
+    if "faces" not in data:
+        raise ValueError(f"got {data['kind']}; expected vtkPolyData")
+    points, faces = data["points"].astype(np.float64), data["faces"].astype(np.int64)
+    at_points, at_cells = (
+        {key.removeprefix(place): values for key, values in data.items() if key.startswith(place)}
+        for place in ("point:", "cell:")
+    )
+    of_faces = {name: values[data["cells_of_faces"]] for name, values in at_cells.items()}
     return Loaded(points, faces, real_arrays(at_points, len(points)), real_arrays(of_faces, len(faces)))
 
 
@@ -212,7 +207,6 @@ def real_arrays(named: Mapping[str, Any], n: int) -> dict[str, Float[np.ndarray,
 
 
 def fans(
-    file: Path,
     points: Float[np.ndarray, "V 3"],
     polygons: Int[np.ndarray, "n corners"],
     numbers: Int[np.ndarray, " n"] | None = None,
@@ -220,13 +214,13 @@ def fans(
     """Cut each polygon into triangles that share its first corner from which all other corners are visible.
 
     Raises:
-        ValueError: a polygon has a vertex that does not exist, or no corner from which all other corners are visible.
+        UnsuitedError: a polygon has a vertex that does not exist, or no corner that sees all other corners.
     """
     if polygons.ndim != 2 or polygons.shape[1] < 3:
-        raise ValueError(f"{file}: got faces of shape {polygons.shape}; expected at least 3 corners each")
+        raise UnsuitedError(f"got faces of shape {polygons.shape}; expected at least 3 corners each")
     (n, size), low, high = polygons.shape, polygons.min(initial=0), polygons.max(initial=0)
     if low < 0 or high >= len(points):
-        raise ValueError(f"{file}: a face refers to vertex {low if low < 0 else high}; expected 0 … {len(points) - 1}")
+        raise UnsuitedError(f"a face refers to vertex {low if low < 0 else high}; expected 0 … {len(points) - 1}")
     if size == 3:
         return polygons[:, None]
     found = np.full((n, size - 2, 3), -1)
@@ -242,8 +236,8 @@ def fans(
     bad = np.flatnonzero((found < 0).any(axis=(1, 2)))
     if bad.size:
         which = bad[0] if numbers is None else numbers[bad[0]]
-        raise ValueError(
-            f"{file}: face {which} with {size} corners is not star-shaped about any corner. Cut it into triangles"
+        raise UnsuitedError(
+            f"face {which} with {size} corners is not star-shaped about any corner. Cut it into triangles"
         )
     return found
 
@@ -256,61 +250,59 @@ def load_obj(file: Path) -> Loaded:
     """Load the vertices and faces of an OBJ file; ignore normals, texture coordinates, colours and groups."""
     vertices: list[list[float]] = []
     polygons: list[list[int]] = []
-    with reading(file, "a readable OBJ mesh"):
-        text = file.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
-        for number, line in enumerate(text.splitlines(), 1):
-            words = line.partition("#")[0].split()
-            if words[:1] == ["v"]:
-                if len(words) < 4:
-                    raise ValueError(f"line {number}: got {len(words) - 1} coordinates for a vertex; expected 3")
-                vertices.append([float(word) for word in words[1:4]])
-            elif words[:1] == ["f"]:
-                corners = [int(word.partition("/")[0]) for word in words[1:]]
-                if 0 in corners or len(corners) < 3:
-                    raise ValueError(f"line {number}: got the face {' '.join(words[1:])}; expected 3 vertices or more")
-                # Vertices are numbered from 1. A negative number counts backwards from the last vertex read so far.
-                polygons.append([corner - 1 if corner > 0 else len(vertices) + corner for corner in corners])
-    return _by_size(file, vertices, polygons)
+    text = file.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.partition("#")[0].split()
+        if words[:1] == ["v"]:
+            if len(words) < 4:
+                raise ValueError(f"line {number}: got {len(words) - 1} coordinates for a vertex; expected 3")
+            vertices.append([float(word) for word in words[1:4]])
+        elif words[:1] == ["f"]:
+            corners = [int(word.partition("/")[0]) for word in words[1:]]
+            if 0 in corners or len(corners) < 3:
+                raise ValueError(f"line {number}: got the face {' '.join(words[1:])}; expected 3 vertices or more")
+            # Vertices are numbered from 1. A negative number counts backwards from the last vertex read so far.
+            polygons.append([corner - 1 if corner > 0 else len(vertices) + corner for corner in corners])
+    return _by_size(vertices, polygons)
 
 
 def load_off(file: Path) -> Loaded:
     """Load the vertices and faces of an OFF file; ignore colours, normals and texture coordinates."""
-    with reading(file, "a readable OFF mesh"):
-        text = file.read_text(encoding="utf-8", errors="replace")
-        lines = [line for line in (line.partition("#")[0].strip() for line in text.splitlines()) if line]
-        keyword = _KEYWORD.match(lines[0]) if lines else None
-        if keyword is None:
-            raise ValueError("the file does not begin with OFF, COFF, NOFF or STOFF")
-        # The numbers of vertices and faces follow the keyword on the same line, even without a space, or on the next.
-        head, *rest = filter(None, (lines[0][keyword.end() :].strip(), *lines[1:]))
-        n_vertices, n_faces = (int(word) for word in head.split()[:2])
-        if min(n_vertices, n_faces) < 0 or len(rest) != n_vertices + n_faces:
-            raise ValueError(
-                f"the file declares {n_vertices} vertices and {n_faces} faces, but has {len(rest)} lines for them"
-            )
-        rows = [line.split() for line in rest]
-        columns = {len(row) for row in rows[:n_vertices]}
-        if len(columns) != 1 or min(columns) < 3:
-            raise ValueError(f"lines of vertices have {sorted(columns)} columns; expected equal numbers, at least 3")
-        vertices = [[float(word) for word in row[:3]] for row in rows[:n_vertices]]
-        polygons = [[int(word) for word in row[1 : 1 + int(row[0])]] for row in rows[n_vertices:]]
-        for row, corners in zip(rows[n_vertices:], polygons, strict=True):
-            # In the line of a face, a colour may follow the corners: an index, or three or four numbers.
-            if len(corners) != int(row[0]) or len(corners) < 3 or len(row) - 1 - len(corners) > 4:
-                raise ValueError(f"got the face {' '.join(row)[:60]}; expected n, n corners, an optional colour")
-    return _by_size(file, vertices, polygons)
+    text = file.read_text(encoding="utf-8", errors="replace")
+    lines = [line for line in (line.partition("#")[0].strip() for line in text.splitlines()) if line]
+    keyword = _KEYWORD.match(lines[0]) if lines else None
+    if keyword is None:
+        raise ValueError("the file does not begin with OFF, COFF, NOFF or STOFF")
+    # The numbers of vertices and faces follow the keyword on the same line, even without a space, or on the next.
+    head, *rest = filter(None, (lines[0][keyword.end() :].strip(), *lines[1:]))
+    n_vertices, n_faces = (int(word) for word in head.split()[:2])
+    if min(n_vertices, n_faces) < 0 or len(rest) != n_vertices + n_faces:
+        raise ValueError(
+            f"the file declares {n_vertices} vertices and {n_faces} faces, but has {len(rest)} lines for them"
+        )
+    rows = [line.split() for line in rest]
+    columns = {len(row) for row in rows[:n_vertices]}
+    if len(columns) != 1 or min(columns) < 3:
+        raise ValueError(f"lines of vertices have {sorted(columns)} columns; expected equal numbers, at least 3")
+    vertices = [[float(word) for word in row[:3]] for row in rows[:n_vertices]]
+    polygons = [[int(word) for word in row[1 : 1 + int(row[0])]] for row in rows[n_vertices:]]
+    for row, corners in zip(rows[n_vertices:], polygons, strict=True):
+        # In the line of a face, a colour may follow the corners: an index, or three or four numbers.
+        if len(corners) != int(row[0]) or len(corners) < 3 or len(row) - 1 - len(corners) > 4:
+            raise ValueError(f"got the face {' '.join(row)[:60]}; expected n, n corners, an optional colour")
+    return _by_size(vertices, polygons)
 
 
 def triangulated(
-    file: Path, points: Float[np.ndarray, "V 3"], polygons: list[tuple[Int[np.ndarray, " _"], Int[np.ndarray, "_ _"]]]
+    points: Float[np.ndarray, "V 3"], polygons: list[tuple[Int[np.ndarray, " _"], Int[np.ndarray, "_ _"]]]
 ) -> tuple[Loaded, Int[np.ndarray, " triangles"]]:
     """Cut polygons into triangles, and return the triangles in the order of the polygons, with their polygons' numbers.
 
     Each entry of `polygons` has the numbers of polygons with n corners, and their corners.
     """
     if not polygons:
-        raise ValueError(f"{file}: the mesh has no triangles; expected at least one face")
-    triangles = [fans(file, points, corners, which) for which, corners in polygons]
+        raise UnsuitedError("the mesh has no triangles; expected at least one face")
+    triangles = [fans(points, corners, which) for which, corners in polygons]
     polygon = np.concatenate(
         [np.repeat(which, each.shape[1]) for (which, _), each in zip(polygons, triangles, strict=True)]
     )
@@ -318,11 +310,11 @@ def triangulated(
     return Loaded(points, np.concatenate([each.reshape(-1, 3) for each in triangles])[order]), polygon[order]
 
 
-def _by_size(file: Path, vertices: list[list[float]], polygons: list[list[int]]) -> Loaded:
+def _by_size(vertices: list[list[float]], polygons: list[list[int]]) -> Loaded:
     """Return the triangles of polygons."""
     sizes = np.array([len(polygon) for polygon in polygons], np.int64)
     groups = [
         (which, np.array([polygons[i] for i in which]))
         for which in map(np.flatnonzero, sizes == np.unique(sizes)[:, None])
     ]
-    return triangulated(file, np.array(vertices, np.float64).reshape(-1, 3), groups)[0]
+    return triangulated(np.array(vertices, np.float64).reshape(-1, 3), groups)[0]

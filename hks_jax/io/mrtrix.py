@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from hks_jax.io.tensor_order import FRAMES, matrices
 from hks_jax.io.volume import Format, TensorVolume, placed
-from hks_jax.storage import content_of, existing, reading
+from hks_jax.storage import content_of, reading
 
 _MAGIC = b"mrtrix image"
 _KINDS = {"Int": "i", "UInt": "u", "Float": "f"}
@@ -19,8 +19,7 @@ _KINDS = {"Int": "i", "UInt": "u", "Float": "f"}
 
 def _load(name: str) -> tuple[np.ndarray, Float[np.ndarray, "4 4"], str]:
     """Return the voxel values (axes as in the header), the affine to scanner coordinates, and the unit of length."""
-    file = existing(name)
-    with reading(file, "a readable MRtrix image (.mif)"):
+    with reading(name, "a readable MRtrix image (.mif)") as file:
         content = content_of(file)
         header, offset = _header(content)
         shape = tuple(int(n) for n in header["dim"][0].split(","))

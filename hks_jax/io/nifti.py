@@ -20,7 +20,7 @@ from hks_jax.io.units import UNITS, Unit, by_axis, in_mm2_per_s, unit_in
 from hks_jax.io.volume import AXES, Format, TensorVolume, corners, describe_tensors, images_of, own_record, placed
 from hks_jax.naming import argument
 from hks_jax.optional import optional
-from hks_jax.storage import atomic_path, content_of, existing, reading
+from hks_jax.storage import UnsuitedError, atomic_path, content_of, reading
 
 SUFFIXES = (".nii", ".nii.gz")
 SYMMETRIC_MATRIX = 1005
@@ -45,10 +45,13 @@ def is_nifti(path: str | os.PathLike[str]) -> bool:
     return os.fspath(path).lower().endswith(SUFFIXES)
 
 
-def load(name: str) -> Any:
-    """Open a NIfTI image, and check its length and the checksum of a compressed file."""
-    nib, file = optional("nibabel"), existing(name)
-    with reading(file, "a readable NIfTI image"):
+def load(name: str) -> tuple[Any, np.ndarray]:
+    """Return a NIfTI image and its scaled voxel values; check its length and the checksum of a compressed file.
+
+    The values are in float32 if nibabel returns float32, otherwise in float64.
+    """
+    nib = optional("nibabel")
+    with reading(name, "a readable NIfTI image") as file:
         with open(file, "rb") as stream:
             compressed = stream.read(2) == b"\x1f\x8b"
         if compressed or file.name.lower().endswith(".gz"):  # the content counts, because nibabel goes by the name
@@ -57,12 +60,16 @@ def load(name: str) -> Any:
             image, length = kind.from_bytes(content), len(content)
         else:
             image, length = nib.load(file), file.stat().st_size
-        data = image.dataobj
-        declared = data.offset + math.prod(image.shape) * data.dtype.itemsize
+        stored = image.dataobj
+        declared = stored.offset + math.prod(image.shape) * stored.dtype.itemsize
         if declared != length:
-            raise ValueError(f"got {length} bytes; expected {declared} for {data.dtype} of shape {image.shape}")
+            raise ValueError(f"got {length} bytes; expected {declared} for {stored.dtype} of shape {image.shape}")
         _warn_of_zero_spacing(name, image)
-    return image
+        data = np.asarray(stored)
+        if data.dtype.kind not in "fiub":
+            raise UnsuitedError(f"got voxels of type {data.dtype}; expected real numbers")
+    dtype = data.dtype if data.dtype.kind == "f" and data.dtype.itemsize in (4, 8) else np.dtype(np.float64)
+    return image, np.ascontiguousarray(data, dtype=dtype.newbyteorder("="))
 
 
 def _warn_of_zero_spacing(name: str, image: Any) -> None:
@@ -78,16 +85,6 @@ def _warn_of_zero_spacing(name: str, image: Any) -> None:
         )
 
 
-def voxels(name: str, image: Any) -> np.ndarray:
-    """Return the scaled voxel values of a loaded image, in float32 if nibabel returns float32, otherwise in float64."""
-    with reading(name, "a readable NIfTI image"):
-        data = np.asarray(image.dataobj)
-    if data.dtype.kind not in "fiub":
-        raise ValueError(f"{name}: got voxels of type {data.dtype}; expected real numbers")
-    dtype = data.dtype if data.dtype.kind == "f" and data.dtype.itemsize in (4, 8) else np.dtype(np.float64)
-    return np.ascontiguousarray(data, dtype=dtype.newbyteorder("="))
-
-
 def affine_in_mm(name: str, image: Any) -> tuple[np.ndarray, str]:
     """Return the affine with lengths in mm, and the unit of length that the file declares (empty if it has none)."""
     code = int(image.header["xyzt_units"]) & 7
@@ -98,8 +95,8 @@ def affine_in_mm(name: str, image: Any) -> tuple[np.ndarray, str]:
 
 
 def _read_image(name: str) -> tuple[np.ndarray, np.ndarray, str]:
-    image = load(name)
-    return voxels(name, image), *affine_in_mm(name, image)
+    image, voxels = load(name)
+    return voxels, *affine_in_mm(name, image)
 
 
 def sidecar_of(path: str | os.PathLike[str]) -> Path:
@@ -159,9 +156,12 @@ def _own_record(image: Any, affine: np.ndarray) -> dict[str, Any]:
     return {}
 
 
-def read_tensors(name: str, order: str | None, frame: str | None, image: Any = None) -> TensorVolume:
-    """Read tensors from a file, or from the loaded image `image`; see `hks_jax.io.read_tensors`."""
-    image = load(name) if image is None else image
+def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolume:
+    """Read tensors from a file; see `hks_jax.io.read_tensors`."""
+    return _tensors_of(name, *load(name), order, frame)
+
+
+def _tensors_of(name: str, image: Any, voxels: np.ndarray, order: str | None, frame: str | None) -> TensorVolume:
     shape = image.shape
     if shape[3:] not in ((6,), (1, 6)):
         remedy = "Fit tensors to diffusion-weighted images first by hks_jax.io.fit_dwi, or by --bval and --bvec"
@@ -176,7 +176,7 @@ def read_tensors(name: str, order: str | None, frame: str | None, image: Any = N
     affine, length_unit = affine_in_mm(name, image)
     encoding, record, notes = _encoding(name), _own_record(image, affine) if declared else {}, list[str]()
     by_bids = "fsl" if encoding.get("Type") == "tensor" else ""  # BIDS has FSL's order, xx xy xz yy yz zz
-    found = matrices(name, voxels(name, image).reshape(*shape[:3], 6), order, "nifti" if declared else by_bids)
+    found = matrices(name, voxels.reshape(*shape[:3], 6), order, "nifti" if declared else by_bids)
     if declared and found.order != "nifti":
         notes.append(f'components read in order "{order}", as asked; the file declares NIfTI\'s symmetric-matrix order')
     by_sidecar = _REFERENCES.get(encoding.get("Reference", ""))
@@ -217,7 +217,7 @@ def siblings(path: str | os.PathLike[str]) -> list[str]:
     ``dtxx.nii`` and ``dtxy.nii``, differ only in the component.
     """
     name = os.fspath(path)
-    if component_of(name) is None or not is_nifti(name) or math.prod(load(name).shape[3:]) != 1:
+    if component_of(name) is None or not is_nifti(name) or math.prod(load(name)[0].shape[3:]) != 1:
         return [name]
     folder, file = os.path.split(name)
     start, end = list(_COMPONENT.finditer(file))[-1].span(1)
@@ -247,7 +247,7 @@ def read_components(paths: Sequence[str], order: str | None, frame: str | None) 
             f"files: got {given}; expected six NIfTI images, one for each component {' '.join(names)}. Name the files "
             "by their components, as in sub-01_param-txx_dwimap.nii.gz or dtxx.nii.gz"
         )
-    images = [load(files[name]) for name in names]
+    images, voxels = zip(*(load(files[name]) for name in names), strict=True)
     first, affine = images[0], affine_in_mm(files["xx"], images[0])[0]
     for name, image in zip(names, images, strict=True):
         if image.shape != first.shape or math.prod(image.shape[3:]) != 1:
@@ -256,10 +256,10 @@ def read_components(paths: Sequence[str], order: str | None, frame: str | None) 
             )
         if not np.allclose(affine_in_mm(files[name], image)[0], affine, rtol=1e-4, atol=1e-3):
             raise ValueError(f"{files[name]}: its affine differs from that of {files['xx']}; expected equal affines")
-    values = np.stack([voxels(files[name], image) for name, image in zip(names, images, strict=True)], axis=-1)
-    joined = optional("nibabel").Nifti1Image(values.reshape(*first.shape[:3], 1, 6), first.affine, first.header)
+    values = np.stack(voxels, axis=-1).reshape(*first.shape[:3], 1, 6)
+    joined = optional("nibabel").Nifti1Image(values, first.affine, first.header)
     joined.header.set_intent(SYMMETRIC_MATRIX, (3,))
-    return read_tensors(files["xx"], None, frame, joined)
+    return _tensors_of(files["xx"], joined, values, None, frame)
 
 
 def placement_notes(image: Any) -> list[str]:

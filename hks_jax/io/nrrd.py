@@ -13,12 +13,12 @@ import numpy as np
 from jaxtyping import Float
 
 from hks_jax.io.repair import require_symmetric
-from hks_jax.io.tensor_order import matrices, nearest_rotation, pack, to_voxel_axes
+from hks_jax.io.tensor_order import matrices, nearest_rotation, pack, shear_notes, to_voxel_axes
 from hks_jax.io.units import millimetres
-from hks_jax.io.volume import Format, TensorVolume, describe_tensors, images_of, own_record, shear_notes
+from hks_jax.io.volume import Format, TensorVolume, describe_tensors, images_of, own_record
 from hks_jax.naming import argument
 from hks_jax.optional import optional
-from hks_jax.storage import atomic_path, existing, reading
+from hks_jax.storage import atomic_path, reading
 
 KINDS = {
     f"{d}D-{masked}{symmetric}matrix": (d * (d + 1) // 2 if symmetric else d * d) + bool(masked)
@@ -83,8 +83,8 @@ class Placement(NamedTuple):
 
 def load(name: str) -> tuple[np.ndarray, dict[str, Any]]:
     """Return the array in native byte order, with the fastest axis of the file first, and the header."""
-    nrrd, file = optional("nrrd"), existing(name)
-    with reading(file, "a readable NRRD file"), open(file, "rb") as stream, warnings.catch_warnings():
+    nrrd = optional("nrrd")
+    with reading(name, "a readable NRRD file") as file, open(file, "rb") as stream, warnings.catch_warnings():
         warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)  # malformed text
         header = dict(nrrd.read_header(stream))
         start = stream.tell()

@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from hks_jax.io.mesh_formats import Loaded, real_arrays, triangulated
-from hks_jax.storage import reading
 
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -42,22 +41,21 @@ class Rows(NamedTuple):
 
 def load_ply(file: Path) -> Loaded:
     """Load vertices and faces with the numbers at them; ignore other elements and lists."""
-    with reading(file, "a readable PLY mesh"):
-        form, elements, body = _parsed(file.read_bytes())
-        if form == "ascii":
-            body = np.array(body.split(), np.float64).tobytes()
-        end, found = 0, {}
-        for name, count, properties in elements:
-            found[name], end = _rows(body, end, count, properties, _ORDERS[form], form == "ascii")
-        if body[end:].strip():
-            raise ValueError(f"got {len(body)} bytes of elements; expected {end}, as the header declares")
-        n_points, n_faces = (sum(len(rows.numbers) for rows in found.get(name, ())) for name in ("vertex", "face"))
-        declared = {name: properties for name, _, properties in elements}
-        points, faces = (_columns(found.get(name, []), declared.get(name, [])) for name in ("vertex", "face"))
-        vertices = np.stack([points.pop(axis) for axis in "xyz"], axis=-1).astype(np.float64)
-        corners = [p.name for p in declared.get("face", ()) if p.name in _CORNERS and p.length]
-        polygons = [(rows.numbers, _integers(rows.values[corners[0]])) for rows in found.get("face", ())]
-    loaded, face = triangulated(file, vertices, polygons)
+    form, elements, body = _parsed(file.read_bytes())
+    if form == "ascii":
+        body = np.array(body.split(), np.float64).tobytes()
+    end, found = 0, {}
+    for name, count, properties in elements:
+        found[name], end = _rows(body, end, count, properties, _ORDERS[form], form == "ascii")
+    if body[end:].strip():
+        raise ValueError(f"got {len(body)} bytes of elements; expected {end}, as the header declares")
+    n_points, n_faces = (sum(len(rows.numbers) for rows in found.get(name, ())) for name in ("vertex", "face"))
+    declared = {name: properties for name, _, properties in elements}
+    points, faces = (_columns(found.get(name, []), declared.get(name, [])) for name in ("vertex", "face"))
+    vertices = np.stack([points.pop(axis) for axis in "xyz"], axis=-1).astype(np.float64)
+    corners = [p.name for p in declared.get("face", ()) if p.name in _CORNERS and p.length]
+    polygons = [(rows.numbers, _integers(rows.values[corners[0]])) for rows in found.get("face", ())]
+    loaded, face = triangulated(vertices, polygons)
     of_faces = {name: values[face] for name, values in real_arrays(faces, n_faces).items()}
     return loaded._replace(arrays=real_arrays(points, n_points), of_cells=of_faces)
 

@@ -3,14 +3,14 @@
 import math
 from dataclasses import replace
 from itertools import product
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from scipy import ndimage
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.checks import real_array, require_number
+from hks_jax.checks import require_number
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_checks import (
     MANY,
@@ -18,7 +18,7 @@ from hks_jax.domain.tensor_checks import (
     PositiveMap,
     least_eigenvalue,
     positive_map,
-    refuse,
+    refuse_tensors,
     unsymmetric,
 )
 from hks_jax.io.units import is_plausible, median_mean_diffusivity
@@ -58,6 +58,28 @@ def least_admissible(volume: TensorVolume) -> float:
     return max(_SINGULAR * median, _NO_LIQUID) if diffusion and not volume.repair else 0.0
 
 
+class Invalid(NamedTuple):
+    """The invalid tensors inside the mask of a volume; see `find_invalid`."""
+
+    bad: Bool[np.ndarray, "*shape"]  # all voxels of invalid tensors
+    singular: Bool[np.ndarray, "*shape"]  # the voxels of invalid tensors that are positive definite
+    floor: float  # the least admissible eigenvalue
+
+
+def invalid_in(volume: TensorVolume, floor: float | None = None) -> Invalid:
+    """Find the invalid tensors of a volume as `find_invalid` does, and tell those that are positive definite."""
+    if floor is None:
+        floor = least_admissible(volume)
+    require_number("floor", floor, above=-math.inf)
+    inside = volume.inside
+    bad, singular = np.zeros(volume.shape, bool), np.zeros(volume.shape, bool)
+    bad[inside] = ~spd.is_spd(volume.tensors[inside])
+    if floor > 0:
+        good = inside & ~bad
+        singular[good] = np.linalg.eigvalsh(volume.tensors[good].astype(np.float64))[:, 0] < floor
+    return Invalid(bad | singular, singular, floor)
+
+
 def find_invalid(volume: TensorVolume, floor: float | None = None) -> Bool[np.ndarray, "*shape"]:
     """Return the voxels inside the mask whose tensor is not finite or has an eigenvalue that is ≤ 0 or < `floor`.
 
@@ -70,27 +92,19 @@ def find_invalid(volume: TensorVolume, floor: float | None = None) -> Bool[np.nd
         >>> print(hj.io.find_invalid(volume).sum(), hj.io.find_invalid(volume, floor=2.0).sum())  # eigenvalues 1 and 4
         0 81
     """
-    inside = volume.inside
-    bad = np.zeros(volume.shape, bool)
-    bad[inside] = ~spd.is_spd(volume.tensors[inside])
-    floor = least_admissible(volume) if floor is None else floor
-    require_number("floor", floor, above=-math.inf)
-    if floor > 0:
-        good = inside & ~bad
-        bad[good] = np.linalg.eigvalsh(volume.tensors[good].astype(np.float64))[:, 0] < floor
-    return bad
+    return invalid_in(volume, floor).bad
 
 
-def describe_invalid(volume: TensorVolume, bad: Bool[np.ndarray, "*shape"]) -> str:
-    """Return words about the tensors that `find_invalid` found, such as "not positive definite, …"."""
-    tensors = volume.tensors[bad]
-    finite, positive = np.isfinite(tensors).all(axis=(-2, -1)), spd.is_spd(tensors)
+def describe_invalid(volume: TensorVolume, found: Invalid) -> str:
+    """Return words about invalid tensors, such as "not positive definite, …"."""
+    tensors, singular = volume.tensors[found.bad], int(found.singular.sum())
+    finite = np.isfinite(tensors).all(axis=(-2, -1))
     words, unit = "not positive definite", f" {volume.unit}" * bool(volume.unit)
-    small = f"with an eigenvalue below {least_admissible(volume):.3g}{unit}"
-    if positive.all():
+    small = f"with an eigenvalue below {found.floor:.3g}{unit}"
+    if singular == len(tensors):
         words = f"nearly singular, {small}"
-    elif positive.any():
-        words += f" or ({int(positive.sum())} of them) nearly singular, {small}"
+    elif singular:
+        words += f" or ({singular} of them) nearly singular, {small}"
     if finite.any():
         words += f", worst eigenvalue {least_eigenvalue(tensors[finite]):.3g}"
     return words + f", {int((~finite).sum())} of them NaN or infinite" * bool((~finite).any())
@@ -98,32 +112,33 @@ def describe_invalid(volume: TensorVolume, bad: Bool[np.ndarray, "*shape"]) -> s
 
 def singular_question(volume: TensorVolume) -> str:
     """Return a question if diffusion tensors are nearly singular (see `find_invalid`), or else the empty text."""
-    singular = find_invalid(volume) & ~find_invalid(volume, 0.0)
+    found = invalid_in(volume)
+    singular = found.singular
     if not singular.any():
         return ""
     first = tuple(np.argwhere(singular)[0].tolist())
     return (
         f"Nearly singular? {int(singular.sum())} of {int(volume.inside.sum())} tensors are "
-        f"{describe_invalid(volume, singular)} (the first at voxel {first}). No tissue has such tensors; in the metric "
-        'D⁻¹ they are extremely large. Use repair_tensors(volume, "nearest")'
+        f"{describe_invalid(volume, found._replace(bad=singular))} (the first at voxel {first}). No tissue has such "
+        'tensors; in the metric D⁻¹ they are extremely large. Use repair_tensors(volume, "nearest")'
     )
 
 
 def require_valid(volume: TensorVolume, argument: str = "repair") -> None:
     """Raise ValueError with remedies if tensors inside the mask of a volume are invalid (see `find_invalid`)."""
-    bad = find_invalid(volume)
-    if bad.any():
-        tensors = volume.tensors[bad]
+    found = invalid_in(volume)
+    if count := int(found.bad.sum()):
         choices = ", ".join(f'"{name}" ({does})' for name, does in REPAIRS.items())
         remedy = f"Choose {argument}: {choices}"
-        if 2 * spd.is_spd(tensors).sum() > len(tensors):
+        if 2 * found.singular.sum() > count:
             remedy += (
                 ". No tissue has eigenvalues so small; programs set them where a fit fails or a voxel has no signal. "
                 "A smaller floor, such as clip:1e-12, keeps them"
             )
-        if bad.sum() > MANY * volume.inside.sum():
-            remedy = f"{_why_so_many(volume, tensors)}. If only a few tensors are invalid, c{remedy[1:]}"
-        refuse("tensors", bad, volume.inside, "voxel", describe_invalid(volume, bad), remedy)
+        if count > MANY * volume.inside.sum():
+            remedy = f"{_why_so_many(volume, found)}. If only a few tensors are invalid, c{remedy[1:]}"
+        what = describe_invalid(volume, found)
+        refuse_tensors("tensors", found.bad, volume.inside, "voxel", what, remedy)
 
 
 def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = None) -> TensorVolume:
@@ -161,8 +176,8 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
     if floor is not None:
         require_number("floor", floor)
     volume = without_background(volume)
-    least = least_admissible(volume) if floor is None else floor
-    bad, inside = find_invalid(volume, least), volume.inside
+    found, inside = invalid_in(volume, floor), volume.inside
+    bad, least = found.bad, found.floor
     finite = bad & np.isfinite(volume.tensors).all(axis=(-2, -1))
     count, of, where = int(bad.sum()), int(inside.sum()), np.argwhere(bad)
     report: dict[str, Any] = {
@@ -179,7 +194,7 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
         return replace(volume, repair=report)
     wrong = f"have an eigenvalue below {least:.3g}" if least else "are not positive definite"
     if count > MANY * of:
-        why = _why_so_many(volume, volume.tensors[bad], floor)
+        why = _why_so_many(volume, found, chosen=floor is not None)
         if count == of:
             raise ValueError(f"repair: all {of} tensors {wrong}. {why}")
         warn_of_accuracy(
@@ -218,15 +233,16 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
     return replace(volume, tensors=tensors, **changed, repair=report, notes=notes)
 
 
-def _why_so_many(volume: TensorVolume, tensors: Float[np.ndarray, "n d d"], floor: float | None = None) -> str:
-    """Return a possible reason for many invalid tensors, such as a wrong order."""
+def _why_so_many(volume: TensorVolume, found: Invalid, chosen: bool = False) -> str:
+    """Return a possible reason for many invalid tensors, such as a wrong order, or a floor that the user chose."""
+    tensors = volume.tensors[found.bad]
     finite = tensors[np.isfinite(tensors).all(axis=(-2, -1))]
     question = "" if volume.invalid_by_order is None else volume.invalid_by_order.question
-    if floor is not None and not question:
+    if chosen and not question:
         return "Choose a lower floor, or leave out voxels at the boundary of the mask"
     if question or not len(finite):
         return question or "Noise does not explain all invalid tensors. Programs often write NaN outside a mask"
-    if 2 * spd.is_spd(finite).sum() > len(finite):
+    if 2 * found.singular.sum() > len(finite):
         return "Noise does not explain all invalid tensors. Programs often write tensors near zero outside a mask"
     largest = np.abs(np.linalg.eigvalsh(finite.astype(np.float64))).max()
     return (
@@ -304,8 +320,7 @@ def positive_tensors(volume: TensorVolume, how: PositiveMap, number: float) -> T
         [2.718 0.368]
     """
     inside, before = volume.inside, int(find_invalid(volume).sum())
-    given = real_array("tensors", volume.tensors)
-    mapped = np.asarray(positive_map("tensors", given, how, number, inside, "voxel"))
+    mapped = np.asarray(positive_map("tensors", volume.tensors, how, number, inside, "voxel"))
     tensors = np.where(inside[..., None, None], mapped, volume.tensors)
     formula = f"exp(S/{number:g})" if how == "exp" else f"S + {number:g}·I"
     note = f"{formula} of all tensors S; {before} of {int(inside.sum())} tensors were not positive definite"

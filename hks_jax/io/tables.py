@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hks_jax.storage import atomic_path, existing, reading
+from hks_jax.storage import atomic_path, reading
 
 MISSING = "n/a"
 
@@ -57,9 +57,8 @@ def read_table(path: Path) -> list[dict[str, str]]:
 
     Empty rows are left out, and so are cells that are empty or ``n/a``.
     """
-    file = existing(path)
-    separator = "," if file.name.lower().endswith(".csv") else "\t"
-    with reading(file, "a table in UTF-8"), open(file, encoding="utf-8-sig", newline="") as stream:
+    separator = "," if path.name.lower().endswith(".csv") else "\t"
+    with reading(path, "a table in UTF-8") as file, open(file, encoding="utf-8-sig", newline="") as stream:
         lines = [[word.strip() for word in line] for line in csv.reader(stream, delimiter=separator)]
     lines = [line for line in lines if any(line)]
     header, rows = (lines[0], lines[1:]) if lines else ([], [])

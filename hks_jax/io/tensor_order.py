@@ -9,7 +9,7 @@ import math
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_checks import MANY
@@ -79,6 +79,19 @@ def nearest_rotation(linear: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d
     return u @ vt
 
 
+def shear_notes(directions: Float[np.ndarray, "d d"]) -> list[str]:
+    """Return a note if the voxel axes (the columns) are not orthogonal, because grids have orthogonal axes."""
+    axes = directions / np.linalg.norm(directions, axis=0)
+    cosine = np.abs(axes.T @ axes - np.eye(len(axes))).max()
+    if cosine <= 1e-3:
+        return []
+    angle = math.degrees(math.acos(min(cosine, 1.0)))
+    return [
+        f"the voxel axes are not orthogonal (two meet at {angle:.3g}°), and the shear is ignored: the computation "
+        "takes them as orthogonal. Resample the tensors to orthogonal axes"
+    ]
+
+
 def indices(order: str, d: int) -> list[tuple[int, int]]:
     """Return the row and the column of each component of a symmetric d × d matrix in the given order."""
     components = ORDERS["fsl" if order == "nrrd" else order]  # NRRD has FSL's order of components
@@ -123,10 +136,14 @@ def invalid_by_order(components: Float[np.ndarray, "*shape n"], order: str) -> I
     """
     rows = components.reshape(-1, components.shape[-1])
     rows = rows[np.any(rows != 0, axis=-1)]
-    sample = rows[:: max(1, len(rows) // _SAMPLE)]
-    if not len(rows) or np.mean(spd.is_spd(unpack(sample, order))) >= 1 - MANY:
+
+    def invalid(some: np.ndarray, order: str) -> Bool[np.ndarray, " n"]:
+        tensors = unpack(some, order)
+        return ~spd.is_spd(tensors)
+
+    if not len(rows) or np.mean(invalid(rows[:: max(1, len(rows) // _SAMPLE)], order)) <= MANY:
         return None
-    counts = {name: int(np.sum(~spd.is_spd(unpack(rows, name)))) for name in ORDERS}
+    counts = {name: int(invalid(rows, name).sum()) for name in ORDERS}
     return InvalidByOrder(order, counts, len(rows))
 
 

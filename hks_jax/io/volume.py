@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -18,7 +17,7 @@ from hks_jax.arrays import describe_array
 from hks_jax.checks import require_real
 from hks_jax.domain.components import as_mask
 from hks_jax.domain.grid import Grid, per_axis
-from hks_jax.io.tensor_order import InvalidByOrder, Matrices, to_voxel_axes
+from hks_jax.io.tensor_order import InvalidByOrder, Matrices, shear_notes, to_voxel_axes
 from hks_jax.uncertainty.noise import TensorNoise
 
 AXES = "xyz"
@@ -256,19 +255,6 @@ def placed(name: str, found: Matrices, frame: str, affine: Float[np.ndarray, "4 
         invalid_by_order=found.invalid,
         **{"length_unit": "mm", **known},
     )
-
-
-def shear_notes(directions: Float[np.ndarray, "d d"]) -> list[str]:
-    """Return a note if the voxel axes (the columns) are not orthogonal, because grids have orthogonal axes."""
-    axes = directions / np.linalg.norm(directions, axis=0)
-    cosine = np.abs(axes.T @ axes - np.eye(len(axes))).max()
-    if cosine <= 1e-3:
-        return []
-    angle = math.degrees(math.acos(min(cosine, 1.0)))
-    return [
-        f"the voxel axes are not orthogonal (two meet at {angle:.3g}°), and the shear is ignored: the computation "
-        "takes them as orthogonal. Resample the tensors to orthogonal axes"
-    ]
 
 
 def mask_in_file(name: str, values: np.ndarray) -> Bool[np.ndarray, "*shape"]:

@@ -18,7 +18,7 @@ from hks_jax.io.tensor_order import matrices, nearest_rotation
 from hks_jax.io.volume import Format, TensorVolume, describe_tensors, mask_in_file, placed
 from hks_jax.naming import argument
 from hks_jax.optional import optional
-from hks_jax.storage import atomic_path, existing, load_npz, reading
+from hks_jax.storage import UnsuitedError, atomic_path, load_npz, reading
 
 _ROOM, _RATIO = 8 << 30, 200
 """The limit of memory for reading an empty file, in bytes, and the increase of the limit per byte of a file."""
@@ -26,16 +26,9 @@ _PATIENCE, _SPEED = 60.0, 1e6
 """The limit of time for reading an empty file, in seconds, and the number of bytes that increase the limit by 1 s."""
 
 
-def holds_dataset(path: str | os.PathLike[str], kind: str) -> bool:
-    """Return whether a legacy .vtk file holds a dataset of a kind such as STRUCTURED_POINTS."""
-    with open(path, "rb") as stream:
-        head = stream.read(1024)
-    return head.startswith(b"# vtk DataFile") and kind.encode() in head.upper()
-
-
 def load(path: Path) -> dict[str, np.ndarray]:
     """Return the arrays that the script `vtk_child` reads from a file in a separate process."""
-    size = existing(path).stat().st_size
+    size = path.stat().st_size
     with tempfile.TemporaryDirectory() as folder:
         arrays = Path(folder) / "arrays.npz"
         script = Path(__file__).with_name("vtk_child.py")
@@ -54,9 +47,7 @@ def load(path: Path) -> dict[str, np.ndarray]:
 
 
 def _read_tensors(name: str, order: str | None, frame: str | None, array: str | None) -> TensorVolume:
-    file = existing(name)
-    kind = "readable VTK image data (.vti, or structured points in .vtk)"
-    with reading(file, kind):
+    with reading(name, "readable VTK image data (.vti, or structured points in .vtk)") as file:
         content, xml = file.read_bytes(), name.lower().endswith(".vti")
         if xml:
             _check_pieces(content)
@@ -65,9 +56,8 @@ def _read_tensors(name: str, order: str | None, frame: str | None, array: str | 
             raise ValueError(f"got {image['kind']}; expected image data or structured points")
         if np.abs(image["direction"].T @ image["direction"] - np.eye(3)).max() > 1e-3:
             raise ValueError(f"Direction: got {image['direction'].tolist()}; expected orthonormal columns")
-    place, chosen, declared = _tensor_array(name, image, array)
-    components = image[f"{place}:{chosen}"]
-    with reading(file, kind):
+        place, chosen, declared = _tensor_array(image, array)
+        components = image[f"{place}:{chosen}"]
         (_check_range if xml else _check_length)(content, chosen, components)
     components = components.astype(np.result_type(components.dtype, np.float32), copy=False)
     found = matrices(name, components, order, "vtk" if declared else "")
@@ -199,7 +189,7 @@ def _check_length(content: bytes, array: str, values: np.ndarray) -> None:
         raise ValueError(f"the file ends before the end of the array {array!r}; expected {values.size} values")
 
 
-def _tensor_array(name: str, image: Mapping[str, np.ndarray], wanted: str | None) -> tuple[str, str, bool]:
+def _tensor_array(image: Mapping[str, np.ndarray], wanted: str | None) -> tuple[str, str, bool]:
     """Return the place (point or cell) and name of the array to read, and whether the file declares it as tensors."""
     for place in ("point", "cell"):
         arrays = {key.partition(":")[2]: a for key, a in image.items() if key.startswith(f"{place}:")}
@@ -213,8 +203,8 @@ def _tensor_array(name: str, image: Mapping[str, np.ndarray], wanted: str | None
     had = {key.partition(":")[2]: a.shape[1:] for key, a in image.items() if key.startswith(("point:", "cell:"))}
     listed = ", ".join(f"{key!r} ({n[0] if n else 1})" for key, n in had.items()) or "none"
     asked = "" if wanted is None else f" named {wanted!r}"
-    raise ValueError(
-        f"{name}: got the arrays (components) {listed}; expected one array of 6 or 9 components{asked}. Pass "
+    raise UnsuitedError(
+        f"got the arrays (components) {listed}; expected one array of 6 or 9 components{asked}. Pass "
         f"{argument('array')}, the name of the array to read"
     )
 

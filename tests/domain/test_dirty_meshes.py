@@ -81,7 +81,7 @@ def test_polygons_are_cut_where_they_are_not_convex(tmp_path):
     """An arrowhead has one diagonal inside; a star with five points has no corner that sees all others."""
     points = np.array([[0.0, 0, 0], [2, 1, 0], [0, 2, 0], [1, 1, 0]])
     arrow = np.array([[0, 1, 2, 3], [1, 2, 3, 0]])
-    for cut in fans(tmp_path, points, arrow):
+    for cut in fans(points, arrow):
         a, b, c = np.moveaxis(points[cut], 1, 0)
         areas = np.cross(b - a, c - a)[:, 2] / 2
         assert (areas > 0).all()

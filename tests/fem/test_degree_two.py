@@ -148,7 +148,7 @@ def test_fields_and_forms_of_degree_two(rng):
     pencil = hj.assemble(mesh, potential=V, **settings)
     for other in (
         hj.assemble(mesh, potential=filled, **settings),
-        hj.assemble(mesh, stiffness=own, fields={"V": V}, **settings),
+        hj.assemble_forms(mesh, own, fields={"V": V}, **settings),
     ):
         assert abs(other.stiffness.to_scipy() - pencil.stiffness.to_scipy()).max() < 1e-13
 

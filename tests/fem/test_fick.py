@@ -376,7 +376,7 @@ def test_meshes_integrate_over_space():
 def test_own_forms_are_integrated_over_space():
     grid = hj.Grid((5, 6), (0.2, 0.3))
     field = fick(grid, diffusivities(grid))
-    own = hj.assemble(field, mass=_product, stiffness=_energy)
+    own = hj.assemble_forms(field, _energy, _product)
     ours = hj.assemble(field)
     for name in ("stiffness", "mass"):
         np.testing.assert_allclose(getattr(own, name).to_dense(), getattr(ours, name).to_dense(), atol=1e-13)

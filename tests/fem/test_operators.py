@@ -92,7 +92,7 @@ def test_gaussian_weight_has_hermite_polynomials_for_eigenfunctions():
         return w["weight"] * u.value * v.value
 
     pencil = hj.assemble(field, density=gauss)
-    own = hj.assemble(field, mass=mass, stiffness=stiffness, fields={"weight": gauss})
+    own = hj.assemble_forms(field, stiffness, mass, fields={"weight": gauss})
     for name in ("stiffness", "mass"):
         np.testing.assert_allclose(getattr(own, name).coefficients, getattr(pencil, name).coefficients, atol=1e-15)
     assert pencil.volume == pytest.approx(64)
@@ -258,7 +258,7 @@ def test_elasticity_agrees_with_scikit_fem_and_has_rigid_modes(rng, domain):
         place[basis.nodal_dofs[component]] = order * c + component
     held = np.zeros_like(expected)
     held[np.ix_(place, place)] = expected
-    pencil = hj.assemble(ours, stiffness=elasticity, fields=fields, components=c)
+    pencil = hj.assemble_forms(ours, elasticity, fields=fields, components=c)
     assert np.abs(pencil.stiffness.to_dense() - held).max() < 1e-13
     pairs = hj.eigenpairs(pencil, modes + 3, throw=True)
     np.testing.assert_array_equal(pairs.eigenvalues[:modes], 0)
@@ -268,7 +268,7 @@ def test_elasticity_agrees_with_scikit_fem_and_has_rigid_modes(rng, domain):
     assert pairs.eigenfunctions.shape == (modes + 3, *nodes, c)
 
     def stiff(mu):
-        moved = hj.assemble(ours, stiffness=elasticity, fields={**fields, "mu": mu}, components=c)
+        moved = hj.assemble_forms(ours, elasticity, fields={**fields, "mu": mu}, components=c)
         return jnp.sum(jnp.exp(-hj.eigenpairs(moved, modes + 2).eigenvalues))
 
     mu = 1.3 + 0.2 * rng.random(nodes)
@@ -289,7 +289,7 @@ def test_components_know_masks_and_boundaries(rng):
 
     for boundary, mass in (("dirichlet-rim", "consistent"), (("periodic", "neumann"), "lumped")):
         scalar = hj.eigenpairs(field, 4, boundary, mass=mass).eigenvalues
-        pairs = hj.eigenpairs(hj.assemble(field, boundary, mass, stiffness=apart, components=2), 8)
+        pairs = hj.eigenpairs(hj.assemble_forms(field, apart, mass, boundary, components=2), 8)
         np.testing.assert_allclose(pairs.eigenvalues, np.repeat(scalar, 2), atol=1e-9)
         assert pairs.eigenfunctions.shape == (8, 8, 7, 2)
         assert np.isnan(pairs.eigenfunctions[:, 0, 0]).all()
@@ -308,15 +308,15 @@ def test_forms_on_a_surface_see_space(rng):
 
     fields = {"along": rng.normal(size=(len(mesh.vertices), 3))}
     built_in = hj.assemble(mesh)
-    own = hj.assemble(mesh, mass=anisotropic, stiffness=lambda u, v, w: u.grad @ w.inverse @ v.grad, fields=fields)
+    own = hj.assemble_forms(mesh, lambda u, v, w: u.grad @ w.inverse @ v.grad, anisotropic, fields=fields)
     assert abs(own.stiffness.to_scipy() - built_in.stiffness.to_scipy()).max() < 1e-12
-    other = hj.assemble(turned, mass=anisotropic, stiffness=lambda u, v, w: u.grad @ w.inverse @ v.grad, fields=fields)
+    other = hj.assemble_forms(turned, mass=anisotropic, fields=fields)
     assert abs(own.mass.to_scipy() - other.mass.to_scipy()).max() < 1e-12
     pairs = hj.eigenpairs(own, 5)
     assert pairs.eigenvalues[0] == 0
     assert (pairs.eigenvalues[1:] < hj.eigenpairs(built_in, 5).eigenvalues[1:]).all()
     with unchecked(), pytest.raises(ValueError, match="mass: got a matrix with 64 negative"):
-        hj.eigenpairs(hj.assemble(mesh, mass=lambda u, v, w: -u.value * v.value), 3)
+        hj.eigenpairs(hj.assemble_forms(mesh, mass=lambda u, v, w: -u.value * v.value), 3)
 
 
 @pytest.mark.slow
@@ -329,13 +329,16 @@ def test_what_is_true_of_the_laplacian_alone_is_left_out():
     assert np.isnan(estimate.resolution_bias[0])
     everything = hj.heat_trace(hj.eigenpairs(pencil, 17**2), [0.3])[0]
     assert estimate.tail[0] == pytest.approx(float(1 - hj.heat_trace(pairs, [0.3])[0] / everything), rel=0.3)
-    own = hj.assemble(euclidean(5, 4.0), stiffness=lambda u, v, w: u.value * v.value)
+    own = hj.assemble_forms(euclidean(5, 4.0), lambda u, v, w: u.value * v.value)
     with pytest.raises(ValueError, match="solver: got 'chebyshev-filter', which needs a positive semidefinite"):
         hj.eigenpairs(own, 3, solver="chebyshev-filter")
     with pytest.raises(ValueError, match="its null space is unknown"):
         hj.hks_spectrum_free(own, [0.1])
     without = hj.hks_spectrum_free(pencil, [0.1, 0.3], method="selected-inversion")
     np.testing.assert_allclose(without, hj.hks(hj.eigenpairs(pencil, 17**2), [0.1, 0.3]), rtol=1e-8)
+
+
+FLAT = flat((6, 6), (5.0, 5.0))
 
 
 def first_order(u, v, w):
@@ -366,26 +369,27 @@ def first_order(u, v, w):
         ({"stiffness": lambda u, v, w: u.value**2 * v.value}, "not linear in u"),
         ({"stiffness": lambda u, v, w: v.value * v.value}, "<lambda>: got a form that does not depend on u"),
         ({"stiffness": lambda u, v, w: w["young"]}, "a form reads 'young'; the fields are none"),
-        ({"stiffness": first_order, "potential": 1.0}, "potential: got a field with your own form"),
         ({"stiffness": "laplace"}, "stiffness: got str; expected a form"),
-        ({"mass": "full"}, 'mass: got \'full\'; expected "consistent", "lumped" or a form'),
-        ({"fields": {"a": 1.0}}, "only a form of your own can use them"),
+        ({"mass": "full"}, 'mass: got \'full\'; expected "consistent" or "lumped"$'),
+        ({"mass": first_order}, "mass: got .*first_order.*; expected .*`assemble_forms` takes a form of your own"),
+        ({"stiffness": elasticity, "mass": "full"}, 'mass: got \'full\'; expected "consistent", "lumped" or a form'),
+        ({"fields": {}, "components": 2}, "stiffness: got none with components > 1"),
         ({"stiffness": elasticity, "components": 2, "boundary": "mirror"}, 'got "mirror" with components'),
         ({"degree": 2}, "degree, midpoints: got degree 2 and no midpoints for a grid"),
     ],
 )
 def test_bad_operators_are_refused(settings, message):
     with unchecked(), pytest.raises(ValueError, match=message):
-        hj.assemble(flat((6, 6), (5.0, 5.0)), **settings)
+        (hj.assemble_forms if settings.keys() & {"stiffness", "fields"} else hj.assemble)(FLAT, **settings)
 
 
 def test_what_cannot_be_looked_at_becomes_nan():
     field = flat((5, 5), (1.0, 1.0))
-    unsymmetric = jax.jit(lambda s: hj.assemble(field, stiffness=first_order, fields={"s": s}).stiffness.coefficients)
+    unsymmetric = jax.jit(lambda s: hj.assemble_forms(field, first_order, fields={"s": s}).stiffness.coefficients)
     assert np.isnan(unsymmetric(1.0)).any()
     with pytest.raises(
         ValueError, match="stiffness: the form closes over traced arrays or numbers; pass all of them as fields="
     ):
-        jax.grad(lambda c: hj.assemble(field, stiffness=lambda u, v, w: c * u.value * v.value).stiffness.flat()[0])(1.0)
+        jax.grad(lambda c: hj.assemble_forms(field, lambda u, v, w: c * u.value * v.value).stiffness.flat()[0])(1.0)
     negative = jax.jit(lambda rho: hj.eigenpairs(hj.assemble(field, density=rho), 3).result)
     assert negative(-1.0) == hj.RESULTS.not_finite

@@ -172,7 +172,7 @@ def test_other_objects_than_arrays_fields_and_eigenpairs_are_named_with_a_remedy
         (lambda: hj.eigh(matrix), r"A: got .*; expected an array of numbers. Pass its .todense\(\)"),
         (lambda: hj.eigenpairs(FIELD.tensors, 3), r"K: got shape .* For tensors, pass TensorField\(grid, tensors\)"),
         (lambda: hj.eigenpairs(FIELD, 3, solver=["dense"]), r"solver: got \['dense'\]; expected \"auto\""),
-        (lambda: hj.assemble(FIELD, fields=path), "fields: got 'tensors.nii'; expected a dictionary"),
+        (lambda: hj.assemble_forms(FIELD, fields=path), "fields: got 'tensors.nii'; expected a dictionary"),
         (lambda: hj.matrix_function(np.eye(2), np.exp), "f: got .*; expected a function of a JAX scalar"),
         (lambda: hj.crop(np.ones(4), GRID), r"values: got shape \(4,\); expected at least 2 axes"),
         (lambda: hj.boundary_influence(VOLUME, [1.0], 3), "domain: got TensorVolume; expected a TensorField"),
