@@ -19,7 +19,7 @@ from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import Reading, read, require_one
 from hks_jax.domain.simplices import WORDS, signed_measure
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
-from hks_jax.fem.assembly import MESH_BOUNDARIES
+from hks_jax.fem.problems import MESH_BOUNDARIES
 from hks_jax.io import TensorVolume, read_mask, sample_tensors
 from hks_jax.io.mesh import load_mesh
 from hks_jax.io.repair import require_valid

@@ -59,6 +59,12 @@ class DoubledEigenpairs(Eigenpairs, eqx.Module):
     rounding = _merged("rounding")
     kept = _merged("kept")
 
+    @classmethod
+    def of(cls, problems: Sequence[PencilEigenpairs], including: Including, k: int) -> "DoubledEigenpairs":
+        """Return the k lowest pairs of all problems; see `MirrorPencil` for ``including``."""
+        order = _order([jax.lax.stop_gradient(each.eigenvalues) for each in problems], including, k)
+        return cls(tuple(problems), order, including, k)
+
     def merged(self, values: Sequence[Any]) -> Array:
         """Return the values (…, k) for each pair, given those for the pairs of each problem."""
         return _in_order(list(values), self._known_order, -1)
@@ -148,12 +154,6 @@ def _order(xp: Any, spectra: Any, including: Including, k: int) -> Any:
     return xp.argsort(xp.concatenate(keys, axis=-1), axis=-1, stable=True)[..., :k]
 
 
-def doubled_pairs(problems: Sequence[PencilEigenpairs], including: Including, k: int) -> DoubledEigenpairs:
-    """Return the k lowest pairs of all problems; see `MirrorPencil` for ``including``."""
-    order = _order([jax.lax.stop_gradient(each.eigenvalues) for each in problems], including, k)
-    return DoubledEigenpairs(tuple(problems), order, including, k)
-
-
 @numpy_where_known(static_argnums=2)
 def _in_order(xp: Any, values: Any, order: Any, axis: int) -> Any:
     """Return the values of all problems, along an axis, in the order of the k lowest eigenvalues."""
@@ -207,7 +207,7 @@ def pairs_of_doubled(
         for i in short:
             wanted[i] = min(limits[i], 2 * wanted[i])
             solved[i] = solve(i, report)
-    return doubled_pairs(solved, pencil.including, k).keeping(jax_array(np.ones(k, bool)))
+    return DoubledEigenpairs.of(solved, pencil.including, k).keeping(jax_array(np.ones(k, bool)))
 
 
 def _limits(pencil: MirrorPencil, k: int) -> list[int]:

@@ -6,23 +6,21 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.arrays import describe_array
 from hks_jax.checks import require_count
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.fem.boundary import BoundarySpec, doubled_problems, normalise_boundary
+from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.elements import Quadrature
 from hks_jax.fem.fields import checked_field
 from hks_jax.fem.forms import Form, WeakForm, l2, laplace_beltrami
 from hks_jax.fem.integrals import assemble_grid, assemble_mesh, grid_points, mesh_nodes, mesh_points
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
-from hks_jax.fem.space import grid_space, mesh_space
+from hks_jax.fem.problems import inclusions, problems_of
 from hks_jax.linear.operators import PatternedOperator, require_symmetric
 from hks_jax.traced import is_traced
 
 MassKind = Literal["consistent", "lumped"]
-MESH_BOUNDARIES = ("neumann", "dirichlet", "mean")
 
 
 def assemble(
@@ -180,18 +178,14 @@ def _assembled(
 ) -> AnyPencil:
     """Return the pencil of forms that read the given fields."""
     operator = operator._replace(fick=getattr(domain, "operator", None) == "fick")
-    nodes = None
+    points: Callable[..., Any]
     if isinstance(domain, SimplicialMesh):
-        if boundary not in MESH_BOUNDARIES:
-            raise ValueError(f"boundary: got {boundary!r}; expected one of {', '.join(map(repr, MESH_BOUNDARIES))}")
-        conditions = ("neumann", "dirichlet") if boundary == "mean" else (boundary,)
         nodes = mesh_nodes(domain, degree, midpoints)
         if degree == 2 and operator.lumped:
             raise ValueError(
                 'mass: got "lumped" with degree=2, where row sums at the vertices are not positive. Use "consistent"'
             )
-        spaces: list[Any] = [mesh_space(domain.triangulation, each, degree) for each in conditions]
-        points, dtype = partial(mesh_points, nodes, spaces[0]), nodes.dtype
+        points, dtype = partial(mesh_points, nodes), nodes.dtype
         at_vertices = (domain.triangulation.n_vertices,)
         given = {
             name: value if callable(value) or np.shape(value)[:1] == at_vertices else domain.restrict(value)
@@ -206,47 +200,22 @@ def _assembled(
         if degree != 1 or midpoints is not None:
             got = f"degree {degree!r} and {'no' if midpoints is None else 'some'} midpoints"
             raise ValueError(f"degree, midpoints: got {got} for a grid, whose elements are Q1; leave both out")
-        sides = normalise_boundary(boundary, domain.grid.dimension)
-        if operator.components > 1 and any("mirror" in pair for pair in sides):
+        if operator.components > 1 and "mirror" in str(boundary):
             raise ValueError('boundary: got "mirror" with components; only scalar functions support "mirror"')
-        spaces = [grid_space(domain.grid, problem) for problem in doubled_problems(sides)]
-        if any("dirichlet" in pair for pair in sides) and (spaces[0].free == spaces[0].domain).all():
-            where = (
-                "acts on the sides of the grid, which the mask does not reach. For the rim of the mask pass "
-                '"dirichlet-rim"'
-                if sides[-1] == ("neumann", "neumann")
-                else "acts nowhere: there is no mask, and so no rim. Leave this condition out"
-            )
-            warn_of_accuracy(f'boundary: got {boundary!r}, but "dirichlet" {where}')
-        dtype = domain.tensors.dtype
-        points, pencil_on = partial(grid_points, domain.grid, spaces[0], dtype), partial(assemble_grid, domain)
+        nodes, dtype = None, domain.tensors.dtype
+        points, pencil_on = partial(grid_points, domain.grid, dtype=dtype), partial(assemble_grid, domain)
+    spaces = problems_of(domain, boundary, degree)
     known, held = not operator.own, {}
     for name, value in given.items():
         settings = {"scalar": known, "positive": known and name == "density"}
-        held[name] = checked_field(name, value, spaces[0], points, dtype, **settings)
+        held[name] = checked_field(name, value, spaces[0], partial(points, spaces[0]), dtype, **settings)
     operator = operator._replace(checked=known or not is_traced((domain, held, nodes)))
     pencils = [pencil_on(held, each, operator) for each in spaces]
     if midpoints is not None and not is_traced(pencils) and np.isnan(pencils[0].mass.diagonal()).any():
         raise ValueError("midpoints: got positions that fold or invert cells; move them closer to the straight edges")
-    return _joined(pencils, operator, "mirror" in str(boundary))
-
-
-def _joined(pencils: list[Pencil], operator: WeakForm, mirrored: bool) -> AnyPencil:
-    """Return the pencil, or the `MirrorPencil` of a doubled domain; check that the user's forms are symmetric."""
     if operator.own and operator.checked:
         for name in ("stiffness", "mass"):
             matrix = getattr(pencils[0], name)
             if isinstance(matrix, PatternedOperator):
                 require_symmetric(name, *matrix.triplets(), matrix.size, "Make the form symmetric in u and v")
-    if len(pencils) == 1:
-        return pencils[0]
-    if pencils[0].space.n_dof == pencils[-1].space.n_dof:
-        if mirrored:
-            raise ValueError(
-                'boundary: got "mirror", but the mask reaches no side of the grid, where the mirrors are. Pass "mean" '
-                "for the rim of the mask"
-            )
-        raise ValueError('boundary: got "mean", but the domain has no rim; pass "neumann"')
-    free = [pencil.space.free for pencil in pencils]
-    including = (tuple(j for j in range(i + 1) if not (own & ~free[j]).any()) for i, own in enumerate(free))
-    return MirrorPencil(tuple(pencils), tuple(including))
+    return pencils[0] if len(pencils) == 1 else MirrorPencil(tuple(pencils), inclusions(spaces))

@@ -279,7 +279,7 @@ def axis_colours(n: int, spacing: int, wraps: bool) -> Int[np.ndarray, " n"]:
 
 def mask_for(values: Any, mask: Bool[np.ndarray, "*shape"]) -> Bool[np.ndarray | Array, "*shape"]:
     """Return the mask, as a JAX array if it is an outer product over axes and ``values`` are traced under `jit`."""
-    axes = _box(mask) if is_traced(values) and is_staged() else None
+    axes = _axes_of(mask) if is_traced(values) and is_staged() else None
     return mask if axes is None else _outer([axis[None] for axis in axes])[0]
 
 
@@ -291,7 +291,7 @@ def couplings_for(values: Any, space: GridSpace) -> Bool[np.ndarray | Array, "of
     staged = is_traced(values) and is_staged()
     if staged and (space.free == space.domain).all():
         return None
-    axes = _box(space.free) if staged else None
+    axes = _axes_of(space.free) if staged else None
     if axes is None:
         return _free_couplings(space)
     return _outer([_coupled(axis, (wraps,)) for axis, wraps in zip(axes, space.periodic, strict=True)])
@@ -306,7 +306,7 @@ def _coupled(free: Bool[np.ndarray, "*shape"], periodic: tuple[bool, ...]) -> Bo
     return np.stack([free & other for other in neighbours(with_rim(free, periodic), free.ndim)])
 
 
-def _box(mask: Bool[np.ndarray, "*shape"]) -> list[Bool[np.ndarray, " _n"]] | None:
+def _axes_of(mask: Bool[np.ndarray, "*shape"]) -> list[Bool[np.ndarray, " _n"]] | None:
     """Return one mask per axis whose outer product is the given mask; None if no such masks exist."""
     d = mask.ndim
     axes = [np.asarray(mask.any(axis=tuple(a for a in range(d) if a != axis))) for axis in range(d)]

@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from hks_jax.eigen.doubled import doubled_pairs
+from hks_jax.eigen.doubled import DoubledEigenpairs
 from hks_jax.eigen.eigenpairs import Eigenpairs, PencilEigenpairs
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
 from hks_jax.storage import load_npz, write_npz
@@ -80,7 +80,7 @@ def pairs_of(name: str, arrays: Mapping[str, np.ndarray], pencil: AnyPencil) -> 
     ]
     pairs: Eigenpairs = problems[0]
     if isinstance(pencil, MirrorPencil):
-        pairs = doubled_pairs(problems, pencil.including, len(arrays["eigenvalues"]))
+        pairs = DoubledEigenpairs.of(problems, pencil.including, len(arrays["eigenvalues"]))
     gap = np.concatenate([_residuals(each) for each in pairs.problems])
     ends = np.array([pairs.next_eigenvalue, *pairs.eigenvalues[-1:], pairs.spectral_origin])
     size = np.max(np.abs(ends[np.isfinite(ends)]))
