@@ -194,7 +194,7 @@ def test_assembly_batches_like_a_loop(rng):
         ({"boundary": (("neumann", "periodic"), "neumann")}, "on both sides"),
         ({"boundary": None}, "boundary: got None; expected one name"),
         ({"boundary": (("neumann",) * 3, "neumann")}, r"boundary: got .* for one axis; expected a name or a pair"),
-        ({"mass": "full"}, 'mass: got \'full\'; expected "consistent", "lumped" or a form'),
+        ({"mass": "full"}, 'mass: got \'full\'; expected "consistent" or "lumped"'),
     ],
 )
 def test_unknown_settings_are_named(arguments, message):
