@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[2]
 DIFFERENCE = """
 width = jnp.exp(-20 * jnp.sum(jnp.asarray(grid.nodes) ** 2, axis=-1))[..., None, None]
 change = 1e-4 * width * jnp.array([[1.0, 0.3], [0.3, -0.5]])
-ends = [float(signature(tensors + sign * change)[1, 18, 18]) for sign in (1, -1)]
+ends = [float(signature(tensors + sign * change)[0, 18, 18]) for sign in (1, -1)]
 print(float(jnp.sum(gradient * change)), (ends[0] - ends[1]) / 2)
 print(*(float(x) for x in (values.max(axis=(1, 2)) - values[:, 18, 18]) / jnp.ptp(values, axis=(1, 2))))
 """
