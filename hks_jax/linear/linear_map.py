@@ -49,7 +49,7 @@ def with_transpose(forward: Callable[[Any], Any], backward: Callable[[Any], Any]
 
     # JAX transposes a solve only if every part of its right-hand side depends on variables, as these zeros formally do.
     def zeros(like: Any, tree: Any) -> Any:
-        empty = [jnp.ravel(leaf)[:0].astype(float) for leaf in jax.tree.leaves(tree)]
+        empty = [jnp.ravel(jnp.atleast_1d(leaf)[:0]).astype(float) for leaf in jax.tree.leaves(tree)]
         nothing = jnp.sum(jnp.concatenate([jnp.zeros(0), *empty]))
         return jax.tree.map(lambda leaf: jnp.full(leaf.shape, nothing, leaf.dtype), like)
 
