@@ -151,7 +151,9 @@ def main() -> None:
                 rows.append(measured(name, n, k, *stage))
                 print(rows[-1], flush=True)
                 note = "compiled on this machine for an NVIDIA H200 from its description; no program ran"
-                write(arguments.output, rows, dtype="float32", note=note)
+                write(
+                    arguments.output, sorted(rows, key=lambda row: (row["nodes"], row["k"])), dtype="float32", note=note
+                )
 
 
 if __name__ == "__main__":

@@ -106,8 +106,8 @@ def is_constant(changes: Any) -> bool:
 def instantiated(changes: Any) -> Any:
     """Return a rule's tangents with arrays in place of symbolic zeros."""
 
-    def full(leaf: Any) -> Any:
-        return np.zeros(leaf.shape, leaf.dtype) if _is_zero(leaf) else leaf
+    def full(leaf: Any) -> Any:  # a single zero in memory, so that programs have no large constants
+        return np.broadcast_to(np.zeros((), leaf.dtype), leaf.shape) if _is_zero(leaf) else leaf
 
     return jax.tree.map(full, changes, is_leaf=_is_zero)
 

@@ -87,6 +87,11 @@ def axes(program: Any) -> Iterator[int]:
                     yield from axes(inner)
 
 
+def stored(constant):
+    """Return the part of a constant that JAX puts into a program: of values that repeat along an axis, the first."""
+    return constant[tuple(slice(1) if stride == 0 else slice(None) for stride in constant.strides)]
+
+
 def signature_of_many(tensors):
     pairs = hj.eigenpairs(hj.TensorField(hj.Grid(CUBE), tensors), MANY, solver=ChebyshevFilter())
     return hj.hks(pairs, np.array([0.5, 1.0], tensors.dtype))
@@ -101,6 +106,6 @@ def test_arrays_of_more_than_2_to_the_31_entries_are_never_flattened(derivative)
     with jax.enable_x64(False):
         program = jax.make_jaxpr(function)(jax.ShapeDtypeStruct((*CUBE, 3, 3), np.float32))
     assert max(axes(program)) < 2**31 < MANY * math.prod(CUBE)
-    known = [np.asarray(constant) for constant in constants(program)]
+    known = [stored(np.asarray(constant)) for constant in constants(program)]
     of_nodes = [constant for constant in known if constant.shape != (MANY, MANY)]
     assert max(constant.nbytes for constant in of_nodes) <= 8 * MANY < math.prod(CUBE)  # not even a mask
