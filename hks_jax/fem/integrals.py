@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from itertools import product
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -111,6 +111,8 @@ def _host_derivative(settings: Settings, geometry: Geometry, tensors: Array, fie
     return None if host is None else host.derivative
 
 
+Sums: TypeAlias = tuple[Array, Array, Array]
+"""Stiffness and mass of some elements, and the metric's volume if it is not the sum of the mass."""
 _AT_ONCE = 1 << 26
 """The number of entries of all element matrices up to which they are computed at once: 2048² or 101³ elements."""
 
@@ -143,9 +145,7 @@ def _compiled_integrals(
             whole = whole + element_matrices(metric, density, points, operator, x, fields)[0] - energy
         return whole, mass
 
-    def matrices(elements: Array, x: Array | None, given: dict[str, Field]) -> tuple[Array, Array, Array]:
-        """Return stiffness and mass of some elements, and the metric's volume if it is not the sum of the mass."""
-
+    def matrices(elements: Any, x: Array | None, given: dict[str, Field]) -> Sums:
         def kept(values: Float[Array, "E n n"]) -> Float[Array, "E n n"]:
             return jnp.where(elements.reshape(-1, 1, 1), values, 0)
 
@@ -165,13 +165,13 @@ def _compiled_integrals(
         return stiffness, mass, volume
 
     if operator.components > 1:
-        stiffness, mass, volume = matrices(elements, x, given)
-        return stiffness, mass, jnp.sum(mass, axis=-1), volume
+        stiffness, mass, _ = matrices(elements, x, given)
+        return stiffness, mass, jnp.sum(mass, axis=-1), jnp.zeros((), mass.dtype)
 
-    def stencils(elements: Array, x: Array | None, given: dict[str, Field]) -> tuple[Array, Array, Array]:
+    def stencils(elements: Any, x: Array | None, given: dict[str, Field]) -> Sums:
         stiffness, mass, volume = matrices(elements, x, given)
-        of_both = (_stencil(each.reshape(*elements.shape, *each.shape[1:])) for each in (stiffness, mass))
-        return *of_both, volume
+        one, other = (_stencil(each.reshape(*elements.shape, *each.shape[1:])) for each in (stiffness, mass))
+        return one, other, volume
 
     planes = max(_AT_ONCE // (4**d * math.prod(elements.shape[1:])), 1)
     whole = stencils if elements.shape[0] <= planes else partial(_in_slabs, stencils, planes)
@@ -221,28 +221,23 @@ def _folded(stencil: Float[Array, "offsets *nodes"], periodic: tuple[bool, ...])
     return stencil
 
 
-# The element matrices of a grid take ten times the memory of its stencils, and some of XLA's kernels for GPUs do not
-# exist for 10⁸ points.
+# The matrices of all elements of a grid, and the intermediate results, take eight times the memory of the stencils.
 def _in_slabs(
-    stencils: Callable[..., tuple[Array, ...]],
+    stencils: Callable[..., Sums],
     planes: int,
     elements: Bool[np.ndarray | Array, "*elements"],
     x: Float[Array, "*elements q d"] | None,
     given: dict[str, Field],
-) -> tuple[Array, ...]:
+) -> Sums:
     """Return ``stencils(elements, x, given)``, computed for ``planes`` planes of elements at a time."""
     count, *others = elements.shape
     elements = jnp.asarray(elements)
 
-    @jax.checkpoint  # derivatives would otherwise store the element matrices of all slabs
-    def of_slab(number: Array, elements: Array, x: Array | None, given: dict[str, Field]) -> tuple[Array, ...]:
+    of_slab = jax.checkpoint(stencils)  # derivatives would otherwise store the element matrices of all slabs
+
+    def add(total: Sums, number: Array) -> tuple[Sums, None]:
         start = jnp.minimum(number * planes, count - planes)
         again = start + jnp.arange(planes) < number * planes  # the last two slabs overlap
-        own = elements & ~again.reshape(-1, *[1] * len(others))
-        return stencils(own, x, given)
-
-    def add(total: tuple[Array, ...], number: Array) -> tuple[tuple[Array, ...], None]:
-        start = jnp.minimum(number * planes, count - planes)
 
         def part(values: Array, size: int = planes, axis: int = 0) -> Array:
             return jax.lax.dynamic_slice_in_dim(values, start, size, axis)
@@ -252,12 +247,13 @@ def _in_slabs(
             return field if field.at == "everywhere" else Field(part(field.values, size), field.at)
 
         some = {name: own(field) for name, field in given.items()}
-        *both, volume = of_slab(number, part(elements), None if x is None else part(x), some)
-        sums = [
+        own_elements = part(elements) & ~again.reshape(-1, *[1] * len(others))
+        *both, volume = of_slab(own_elements, None if x is None else part(x), some)
+        stiffness, mass = (
             jax.lax.dynamic_update_slice_in_dim(whole, part(whole, planes + 1, 1) + each, start, 1)
             for whole, each in zip(total[:2], both, strict=True)
-        ]
-        return (*sums, total[2] + volume), None
+        )
+        return (stiffness, mass, total[2] + volume), None
 
     dtype = given[""].values.dtype
     none = jnp.zeros((3 ** (1 + len(others)), count + 1, *(n + 1 for n in others)), dtype)
