@@ -9,9 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import hks_jax as hj
+from hks_jax.eigen.quality import measure_pairs
+from hks_jax.linear.symmetric_pencil import SymmetricPencil
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -44,6 +47,18 @@ def field(n: int, d: int = 2) -> hj.TensorField:
     frames = np.linalg.qr(rng.standard_normal((*shape, d, d)))[0]
     values = rng.uniform(1, 4, (*shape, d))
     return hj.TensorField(hj.Grid(shape, 1 / (n - 1)), np.einsum("...ia,...a,...ja->...ij", frames, values, frames))
+
+
+def relative_residuals(pencil: hj.Pencil, values: jax.Array, vectors: jax.Array, rows: int = 8) -> np.ndarray:
+    """Return ‖Kφ − λMφ‖ / ‖Mφ‖ / max(λ, λ₁) of each pair, computed in float64 for a few pairs at a time."""
+    found: list[np.ndarray] = []
+    with jax.enable_x64(True):
+        double = jax.tree.map(lambda x: x.astype(jnp.float64), SymmetricPencil(pencil.stiffness, pencil.mass))
+        measure, values = jax.jit(measure_pairs), np.asarray(values, float)
+        for first in range(0, len(values), rows):
+            some = slice(first, first + rows)
+            found.append(np.asarray(measure(double, vectors[some].astype(jnp.float64), jnp.asarray(values[some]))[1]))
+    return np.concatenate(found) / np.maximum(values, values[1])
 
 
 def write(output: Path, rows: Any, **more: Any) -> None:

@@ -109,7 +109,9 @@ def compile_for_chip(function: Callable, *args: Any, **static: Any) -> Any:
         return jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding)
 
     jitted = function if hasattr(function, "lower") else jax.jit(function)
-    return jitted.lower(*jax.tree.map(described, args), **static).compile()
+    # Without a GPU, XLA cannot try out Triton's matrix products, and finds none for some shapes; so it takes cuBLAS's.
+    options = {"xla_gpu_enable_triton_gemm": False}
+    return jitted.lower(*jax.tree.map(described, args), **static).compile(compiler_options=options)
 
 
 class Cost(NamedTuple):

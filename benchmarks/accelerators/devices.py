@@ -1,10 +1,12 @@
 """The work of each device, as counts of operations and bytes sent, on 1, 2, 4 and 8 virtual devices.
 
     python benchmarks/accelerators/devices.py [--nodes 64 48 40] [-o FILE]
+    python benchmarks/accelerators/devices.py --large 256/200 256/500 [-o FILE]
 
 Virtual devices share the machine's cores, so that their wall time says nothing. The traced program of a filter round
 gives the bytes of collectives, loops multiplied out. One number is a time: node·columns a second of the stencil product
-on one device.
+on one device. With ``--large``, volumes are compiled and not computed; the memory of a filter round on each device is
+that of XLA's program for CPUs.
 """
 
 import argparse
@@ -53,32 +55,52 @@ def sent(jaxpr: Any, times: int = 1) -> dict[str, int]:
     return found
 
 
-def counts(shape: tuple[int, ...], devices: int) -> dict:
-    """Return the counts of an inner device of `devices`."""
-    others = min(devices - 1, 1)  # to send anything to
+def filter_round(shape: tuple[int, ...], devices: int, k: int, columns: int) -> tuple[Any, tuple, Any]:
+    """Return a filter round, the shapes of its arguments, and the settings of the filter."""
     mesh = jax.make_mesh((devices,), ("devices",), devices=jax.devices()[:devices])
     slabs = Slabs(mesh, shape, (False,) * len(shape))
     struct = partial(jax.ShapeDtypeStruct, dtype=jnp.float32)
-    spacing = 1 / (max(shape) - 1)
-    pencil = hj.assemble(hj.TensorField(hj.Grid(shape, spacing), jnp.broadcast_to(jnp.eye(3), (*shape, 3, 3))))
-    plan = hj.ChebyshevFilter(block=COLUMNS // 2, mesh=mesh).plan(PAIRS, pencil.space)
-    grid, values = GridFilter(nodal_pencil(pencil), jnp.ones(()), plan), struct((plan.size,))
-    vectors = struct((plan.size, int(np.prod(slabs.padded_shape))))
-    count = jax.ShapeDtypeStruct((), int)
+    grid = hj.Grid(shape, 1 / (max(shape) - 1))
+    pencil = jax.eval_shape(lambda T: hj.assemble(hj.TensorField(grid, T)), struct((*shape, 3, 3)))
+    plan = hj.ChebyshevFilter(block=columns, mesh=mesh).plan(k, pencil.space)
+    parts = jax.sharding.NamedSharding(slabs.mesh, jax.sharding.PartitionSpec(None, slabs.name))
+    whole = jax.sharding.NamedSharding(slabs.mesh, jax.sharding.PartitionSpec())
+    values, count = struct((plan.size,)), jax.ShapeDtypeStruct((), int, sharding=whole)
+    vectors = struct((plan.size, int(np.prod(slabs.padded_shape))), sharding=parts)
     state = FilterState(values, vectors, values, values, count, count)
-    one_round = jax.make_jaxpr(GridFilter.improve)(grid, struct(()), state)
-    exchanged = sent(one_round.jaxpr)
+    nodal = jax.eval_shape(nodal_pencil, pencil)
+    nodal = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=whole), nodal)
+    return GridFilter.improve, (GridFilter(nodal, struct(()), plan), struct(()), state), plan
+
+
+def counts(shape: tuple[int, ...], devices: int, k: int = PAIRS, columns: int = COLUMNS // 2) -> dict:
+    """Return the counts of an inner device of `devices`."""
+    others = min(devices - 1, 1)  # to send anything to
+    function, arguments, plan = filter_round(shape, devices, k, columns)
+    exchanged = sent(jax.make_jaxpr(function)(*arguments).jaxpr)
     return {
         "devices": devices,
         "filter_round": {
             "vectors": plan.size,
             "vectors_filtered": plan.size // devices,
-            "vector_bytes": vectors.size * 4 // devices,
+            "vector_bytes": arguments[2].vectors.size * 4 // devices,
             "all_to_all_bytes": exchanged["all_to_all"] * (devices - 1) // devices,
             "halo_bytes": others * exchanged["ppermute"],
             "sum_bytes": others * exchanged["psum"],
         },
     }
+
+
+def large(n: int, k: int, devices: int = 8) -> dict:
+    """Return the counts for a device and its memory in a filter round on n³ nodes, in GB."""
+    found = counts((n,) * 3, devices, k + 1)["filter_round"]
+    function, arguments, _ = filter_round((n,) * 3, devices, k + 1, COLUMNS // 2)
+    memory = function.lower(*arguments).compile().memory_analysis()
+    arrays = memory.argument_size_in_bytes + memory.output_size_in_bytes - memory.alias_size_in_bytes
+    row = {"nodes": n**3, "k": k, "devices": devices, "vectors": found["vectors"]}
+    row |= {"vectors_filtered": found["vectors_filtered"], "stored_GB": found["vector_bytes"] / 1e9}
+    row |= {f"{name}_GB": found[f"{name}_bytes"] / 1e9 for name in ("all_to_all", "halo", "sum")}
+    return row | {"peak_GB": (arrays + memory.temp_size_in_bytes) / 1e9}
 
 
 def speed(dtype: Any) -> float:
@@ -96,8 +118,15 @@ def main() -> None:
     """Count, print a table, and write the result file."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--nodes", type=int, nargs=3, default=(64, 48, 40), help="along each axis")
-    parser.add_argument("-o", "--output", type=Path, default=RESULTS / "devices.json")
+    parser.add_argument("--large", nargs="+", metavar="N/K", help="N³ nodes, K pairs, on eight devices")
+    parser.add_argument("-o", "--output", type=Path)
     arguments = parser.parse_args()
+    if arguments.large:
+        volumes = [large(*map(int, case.split("/"))) for case in arguments.large]
+        print(*volumes, sep="\n")
+        note = "a filter round was compiled for eight virtual devices; no program ran"
+        write(arguments.output or RESULTS / "devices_large.json", volumes, columns=COLUMNS // 2, note=note)
+        return
     shape = tuple(arguments.nodes)
     speeds = {"float32": speed(jnp.float32)}
     with jax.enable_x64(True):
@@ -111,7 +140,8 @@ def main() -> None:
             f"{filtered['halo_bytes'] / 1e3:8.1f} {filtered['sum_bytes'] / 1e3:8.1f}"
         )
     print({name: f"{value:.2g} node·columns/s" for name, value in speeds.items()})
-    write(arguments.output, rows, nodes=shape, columns=COLUMNS, dtype="float32", node_columns_per_second=speeds)
+    output, about = arguments.output or RESULTS / "devices.json", {"columns": COLUMNS, "dtype": "float32"}
+    write(output, rows, nodes=shape, **about, node_columns_per_second=speeds)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """Checks of tensors and deformation gradients with their messages, and maps from indefinite tensors to metrics."""
 
+import contextlib
 import math
 from typing import Any, Literal, NoReturn
 
@@ -71,6 +72,10 @@ def tensors_on(grid: Any, name: str, tensors: Any) -> Float[Array, "*shape d d"]
     return array
 
 
+_AT_ONCE = 1 << 17
+"""The number of tensors checked at once; checks of 256³ tensors at once would take 7 GB."""
+
+
 def require_spd(
     name: str, tensors: Float[np.ndarray, "*shape d d"], inside: Bool[np.ndarray, "*shape"], place: str
 ) -> None:
@@ -78,6 +83,13 @@ def require_spd(
 
     Messages call the location of a tensor by the word `place`: ``"node"`` on grids, ``"vertex"`` or others on meshes.
     """
+    planes = max(_AT_ONCE * len(inside) // inside.size, 1)
+    if len(inside) > planes:
+        parts = [slice(first, first + planes) for first in range(0, len(inside), planes)]
+        with contextlib.suppress(ValueError):  # the check of all tensors counts those that are wrong
+            for part in parts:
+                require_spd(name, tensors[part], inside[part], place)
+            return
     require_finite_symmetric(name, tensors, inside, place)
     size = np.abs(tensors).max(axis=(-2, -1))
     scaled = tensors / np.where(size > 0, size, 1)[..., None, None]

@@ -1,9 +1,11 @@
 """Integrals of stiffness and mass over the elements of grids and of meshes, and their sums."""
 
+import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from itertools import product
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -111,6 +113,12 @@ def _host_derivative(settings: Settings, geometry: Geometry, tensors: Array, fie
     return None if host is None else host.derivative
 
 
+Sums: TypeAlias = tuple[Array, Array, Array]
+"""Stiffness and mass of some elements, and the metric's volume if it is not the sum of the mass."""
+_AT_ONCE = 1 << 26
+"""The number of entries of all element matrices up to which they are computed at once: 2048² or 101³ elements."""
+
+
 @jit_quickly(static_argnums=0)
 def _compiled_integrals(
     settings: Settings, geometry: Geometry, tensors: Float[Array, "*shape d d"], fields: dict[str, Field]
@@ -119,28 +127,15 @@ def _compiled_integrals(
         settings,
         geometry,
     )
-    element = Element(tensor_product_element(len(periodic)).values, gradients, weights)
+    d = len(periodic)
+    element = Element(tensor_product_element(d).values, gradients, weights)
+    points = replace(element, values=tensor_product_element(d, MASS).values)
     tensors = spd.positive_or_nan(spd.identity_outside(tensors, domain))
-
     # Logarithms of tensors are computed at the nodes, and exponentials at the quadrature points. Optimization barriers
     # keep the compiler from computing an exponential again wherever one of its components is used.
-    nodal = tensors if interpolation == "linear" else spd.log(tensors)
-    at_corners = partial(_at_corners, periodic=periodic)
-    at_points = partial(Field.at_points, corners=at_corners, shape_values=element.values, elements=elements.shape)
-    metric = at_points(Field(nodal, "nodes"))
-    if interpolation == "log-euclidean":
-        metric = jax.lax.optimization_barrier(spd.exp(jax.lax.optimization_barrier(metric)))
-    if operator.fick:  # the tensors are D
-        metric = spd.inverse(metric)
-    metric_density = jnp.sqrt(spd.determinant(metric))
-    density = jnp.ones_like(metric_density) if operator.fick else metric_density
-    held = {name: at_points(field) for name, field in fields.items()}
-    places = None if x is None else x.reshape(-1, *x.shape[-2:])
-
-    def kept(matrices: Float[Array, "E n n"]) -> Float[Array, "E n n"]:
-        return jnp.where(elements.reshape(-1, 1, 1), matrices, 0)
-
-    points = replace(element, values=tensor_product_element(len(periodic), MASS).values)
+    nodal = Field(tensors if interpolation == "linear" else spd.log(tensors), "nodes")
+    given = {name: _wrapped(field, periodic) for name, field in {"": nodal, **fields}.items()}
+    at_corners = partial(_at_corners, d=d)
 
     def integrals(metric: Array, density: Array, x: Array | None, fields: dict[str, Array]) -> tuple[Array, ...]:
         if not operator.cancelling:
@@ -152,41 +147,119 @@ def _compiled_integrals(
             whole = whole + element_matrices(metric, density, points, operator, x, fields)[0] - energy
         return whole, mass
 
-    stiffness, mass = map(kept, jax.vmap(integrals)(metric, density, places, held))
+    def matrices(elements: Any, x: Array | None, given: dict[str, Field]) -> Sums:
+        def kept(values: Float[Array, "E n n"]) -> Float[Array, "E n n"]:
+            return jnp.where(elements.reshape(-1, 1, 1), values, 0)
+
+        held = {name: field.at_points(at_corners, element.values, elements.shape) for name, field in given.items()}
+        metric = held.pop("")
+        if interpolation == "log-euclidean":
+            metric = jax.lax.optimization_barrier(spd.exp(jax.lax.optimization_barrier(metric)))
+        if operator.fick:  # the tensors are D
+            metric = spd.inverse(metric)
+        metric_density = jnp.sqrt(spd.determinant(metric))
+        density = jnp.ones_like(metric_density) if operator.fick else metric_density
+        places = None if x is None else x.reshape(-1, *x.shape[-2:])
+        stiffness, mass = map(kept, jax.vmap(integrals)(metric, density, places, held))
+        volume = jnp.zeros((), mass.dtype)
+        if operator.fick or "density" in fields:
+            volume = jnp.sum(kept((metric_density @ weights)[:, None, None]))
+        return stiffness, mass, volume
+
     if operator.components > 1:
+        stiffness, mass, _ = matrices(elements, x, given)
         return stiffness, mass, jnp.sum(mass, axis=-1), jnp.zeros((), mass.dtype)
-    stiffness, mass = (_stencil(each.reshape(*elements.shape, *each.shape[1:]), periodic) for each in (stiffness, mass))
+
+    def stencils(elements: Any, x: Array | None, given: dict[str, Field]) -> Sums:
+        stiffness, mass, volume = matrices(elements, x, given)
+        one, other = (_stencil(each.reshape(*elements.shape, *each.shape[1:])) for each in (stiffness, mass))
+        return one, other, volume
+
+    planes = max(_AT_ONCE // (4**d * math.prod(elements.shape[1:])), 1)
+    whole = stencils if elements.shape[0] <= planes else partial(_in_slabs, stencils, planes)
+    *both, volume = whole(elements, x, given)
+    stiffness, mass = (_folded(each, periodic) for each in both)
     # The row sums include couplings to eliminated nodes, because only the sum of all basis functions is one.
-    lumped = volumes = jnp.sum(mass, axis=0)
-    if operator.fick or "density" in fields:
-        volumes = kept((metric_density @ weights)[:, None, None])
-    volume = jnp.sum(volumes)
+    lumped = jnp.sum(mass, axis=0)
+    if not (operator.fick or "density" in fields):
+        volume = jnp.sum(lumped)
     if couplings is None:
         return stiffness, mass, lumped, volume
     return jnp.where(couplings, stiffness, 0), jnp.where(couplings, mass, 0), lumped, volume
 
 
-def _at_corners(nodal: Float[Array, "*shape_and_rest"], periodic: tuple[bool, ...]) -> Float[Array, "E n ..."]:
-    d, rest = len(periodic), nodal.shape[len(periodic) :]
-    nodes = jnp.pad(nodal, [*[(0, int(wraps)) for wraps in periodic], *[(0, 0)] * len(rest)], mode="wrap")
-    corners = [nodes[corner] for corner in product(*[(slice(None, -1), slice(1, None))] * d)]
-    return jnp.stack(corners, axis=d).reshape(-1, 2**d, *rest)
+def _wrapped(field: Field, periodic: tuple[bool, ...]) -> Field:
+    """Return a field whose nodal values have the first node again after the last along periodic axes."""
+    if field.at != "nodes":
+        return field
+    ends = [(0, int(wraps)) for wraps in periodic] + [(0, 0)] * (field.values.ndim - len(periodic))
+    return Field(jnp.pad(field.values, ends, mode="wrap"), "nodes")
 
 
-def _stencil(matrices: Float[Array, "*elements n n"], periodic: tuple[bool, ...]) -> Float[Array, "offsets *shape"]:
+def _at_corners(nodal: Float[Array, "*nodes_and_rest"], d: int) -> Float[Array, "E n ..."]:
+    """Return the values at the corners of the elements between all nodes; the first d axes are those of the grid."""
+    corners = [nodal[corner] for corner in product(*[(slice(None, -1), slice(1, None))] * d)]
+    return jnp.stack(corners, axis=d).reshape(-1, 2**d, *nodal.shape[d:])
+
+
+def _stencil(matrices: Float[Array, "*elements n n"]) -> Float[Array, "offsets *nodes"]:
     """Assemble element matrices, whose entry (a, b) couples the node at corner a to the node at offset b − a."""
-    d = len(periodic)
+    d = matrices.ndim - 2
     couplings = jnp.moveaxis(matrices, (-2, -1), (0, 1)).reshape(2**d, *(2,) * d, *matrices.shape[:d])
     # In 3D, one `pad` for each corner a, with all corners b, compiles twice as fast as one `pad` for each pair (a, b).
     total = jnp.zeros((), matrices.dtype)
     for a, node in enumerate(product((0, 1), repeat=d)):
         total = total + jnp.pad(couplings[a], [(1 - i, i) for i in node] + [(i, 1 - i) for i in node])
-    total = total.reshape(3**d, *total.shape[d:])
+    return total.reshape(3**d, *total.shape[d:])
+
+
+def _folded(stencil: Float[Array, "offsets *nodes"], periodic: tuple[bool, ...]) -> Float[Array, "offsets *shape"]:
+    """Add the couplings of the last node along periodic axes to those of the first node, which is the same node."""
     for axis, wraps in enumerate(periodic, start=1):
-        if wraps:  # on a periodic axis, the last node is the first
-            inner = jax.lax.slice_in_dim(total, 0, -1, axis=axis)
-            last = jax.lax.slice_in_dim(total, -1, None, axis=axis)
-            total = inner + jnp.pad(last, [(0, n - 1 if a == axis else 0) for a, n in enumerate(inner.shape)])
+        if wraps:
+            inner = jax.lax.slice_in_dim(stencil, 0, -1, axis=axis)
+            last = jax.lax.slice_in_dim(stencil, -1, None, axis=axis)
+            stencil = inner + jnp.pad(last, [(0, n - 1 if a == axis else 0) for a, n in enumerate(inner.shape)])
+    return stencil
+
+
+# The matrices of all elements of a grid, and the intermediate results, take eight times the memory of the stencils.
+def _in_slabs(
+    stencils: Callable[..., Sums],
+    planes: int,
+    elements: Bool[np.ndarray | Array, "*elements"],
+    x: Float[Array, "*elements q d"] | None,
+    given: dict[str, Field],
+) -> Sums:
+    """Return ``stencils(elements, x, given)``, computed for ``planes`` planes of elements at a time."""
+    count, *others = elements.shape
+    elements = jnp.asarray(elements)
+
+    of_slab = jax.checkpoint(stencils)  # derivatives would otherwise store the element matrices of all slabs
+
+    def add(total: Sums, number: Array) -> tuple[Sums, None]:
+        start = jnp.minimum(number * planes, count - planes)
+        again = start + jnp.arange(planes) < number * planes  # the last two slabs overlap
+
+        def part(values: Array, size: int = planes, axis: int = 0) -> Array:
+            return jax.lax.dynamic_slice_in_dim(values, start, size, axis)
+
+        def own(field: Field) -> Field:
+            size = planes + (field.at == "nodes")
+            return field if field.at == "everywhere" else Field(part(field.values, size), field.at)
+
+        some = {name: own(field) for name, field in given.items()}
+        own_elements = part(elements) & ~again.reshape(-1, *[1] * len(others))
+        *both, volume = of_slab(own_elements, None if x is None else part(x), some)
+        stiffness, mass = (
+            jax.lax.dynamic_update_slice_in_dim(whole, part(whole, planes + 1, 1) + each, start, 1)
+            for whole, each in zip(total[:2], both, strict=True)
+        )
+        return (stiffness, mass, total[2] + volume), None
+
+    dtype = given[""].values.dtype
+    none = jnp.zeros((3 ** (1 + len(others)), count + 1, *(n + 1 for n in others)), dtype)
+    total, _ = jax.lax.scan(add, (none, none, jnp.zeros((), dtype)), jnp.arange(-(-count // planes)))
     return total
 
 

@@ -49,7 +49,7 @@ def with_transpose(forward: Callable[[Any], Any], backward: Callable[[Any], Any]
 
     # JAX transposes a solve only if every part of its right-hand side depends on variables, as these zeros formally do.
     def zeros(like: Any, tree: Any) -> Any:
-        empty = [jnp.ravel(leaf)[:0].astype(float) for leaf in jax.tree.leaves(tree)]
+        empty = [jnp.ravel(jnp.atleast_1d(leaf)[:0]).astype(float) for leaf in jax.tree.leaves(tree)]
         nothing = jnp.sum(jnp.concatenate([jnp.zeros(0), *empty]))
         return jax.tree.map(lambda leaf: jnp.full(leaf.shape, nothing, leaf.dtype), like)
 
@@ -106,8 +106,8 @@ def is_constant(changes: Any) -> bool:
 def instantiated(changes: Any) -> Any:
     """Return a rule's tangents with arrays in place of symbolic zeros."""
 
-    def full(leaf: Any) -> Any:
-        return np.zeros(leaf.shape, leaf.dtype) if _is_zero(leaf) else leaf
+    def full(leaf: Any) -> Any:  # a single zero in memory, so that programs have no large constants
+        return np.broadcast_to(np.zeros((), leaf.dtype), leaf.shape) if _is_zero(leaf) else leaf
 
     return jax.tree.map(full, changes, is_leaf=_is_zero)
 

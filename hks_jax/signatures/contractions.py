@@ -23,6 +23,8 @@ from hks_jax.signatures.filters import Filter, mixing
 _matmul = partial(jnp.matmul, precision="highest")
 _ON_HOST = 1 << 22
 """NumPy computes derivatives if neither the eigenvectors nor all filters' matrices have more entries than this."""
+_SQUARES = 1 << 28
+"""The number of squares φᵢ(x)² that are computed at once, because more of them would take the memory of the vectors."""
 
 
 class Contraction(eqx.Module):
@@ -44,7 +46,21 @@ class Diagonal(Contraction):
 
     def weighted(self, weights: Float[Array, "m k"], vectors: Float[Array, "k n"]) -> Float[Array, "m n"]:
         """Return Σᵢ cᵢ φᵢ(x)²."""
-        return _matmul(weights, jnp.square(vectors))
+
+        def of_some(some: Float[Array, "k width"]) -> Float[Array, "m width"]:
+            return _matmul(weights, jnp.square(some))
+
+        k, n = vectors.shape
+        if k * n <= _SQUARES:
+            return of_some(vectors)
+        width = max(_SQUARES // k, 1)
+
+        def put(number: Array, values: Float[Array, "m n"]) -> Float[Array, "m n"]:
+            start = jnp.minimum(number * width, n - width)
+            part = of_some(jax.lax.dynamic_slice_in_dim(vectors, start, width, axis=1))
+            return jax.lax.dynamic_update_slice_in_dim(values, part, start, axis=1)
+
+        return jax.lax.fori_loop(0, -(-n // width), put, jnp.zeros((len(weights), n), vectors.dtype))
 
     def mixed(
         self, matrices: Float[Array, "m k k"], vectors: Float[Array, "k n"], matters: Bool[Array, "m k"]

@@ -8,7 +8,7 @@ from annotations import unchecked
 from fields import random_spd
 
 import hks_jax as hj
-from hks_jax.domain import spd
+from hks_jax.domain import spd, tensor_checks
 
 
 @pytest.mark.parametrize("shape", [(4, 5), (3, 4, 5)])
@@ -143,6 +143,15 @@ def corrupted(rng, node, value) -> np.ndarray:
 def test_bad_tensors_are_counted_and_located(rng, value, message):
     with pytest.raises(ValueError, match=message):
         hj.TensorField(hj.Grid((4, 5)), corrupted(rng, (2, 3), value))
+
+
+def test_tensors_checked_in_parts_are_counted_together(monkeypatch):
+    tensors = np.tile(np.eye(2), (9, 4, 1, 1))
+    monkeypatch.setattr(tensor_checks, "_AT_ONCE", 8)
+    assert hj.TensorField(hj.Grid((9, 4)), tensors).tensors.shape == tensors.shape
+    tensors[[2, 8], [1, 3], 0, 0] = -1.0
+    with pytest.raises(ValueError, match=r"2 of 36 tensors are not positive definite.* at node \(2, 1\)"):
+        hj.TensorField(hj.Grid((9, 4)), tensors)
 
 
 def test_wrong_shapes_and_types_are_named(rng):

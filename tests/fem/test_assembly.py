@@ -1,5 +1,8 @@
 """Stiffness and mass against scikit-fem's own assembly of the same weak form, and against closed forms."""
 
+import math
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +16,7 @@ from scipy.sparse import csc_matrix
 from skfem.models.poisson import laplace, mass
 
 import hks_jax as hj
+from hks_jax.fem import integrals
 
 
 def skfem_matrices(grid: hj.Grid, tensors: np.ndarray, metric_of=lambda T: T) -> tuple[csc_matrix, csc_matrix]:
@@ -115,6 +119,34 @@ def test_periodic_assembly_is_the_folded_one(rng):
     for name in ("stiffness", "mass"):
         big, small = getattr(unrolled, name).to_dense(), getattr(periodic, name).to_dense()
         np.testing.assert_allclose(fold.T @ big @ fold, small, atol=1e-13)
+
+
+@pytest.mark.parametrize("shape", [(8, 5), pytest.param((8, 4, 5), marks=pytest.mark.slow)])
+def test_elements_in_slabs_sum_to_the_same_matrices_and_derivatives(rng, monkeypatch, shape):
+    """Large grids are assembled a few planes of elements at a time; the last slab overlaps the one before it."""
+    d, raw = len(shape), integrals._compiled_integrals.__wrapped__
+    monkeypatch.setattr(
+        integrals, "_grid_integrals", lambda settings, *arrays: jax.jit(partial(raw, settings))(*arrays)
+    )
+    inside = np.ones(shape, bool)
+    inside[:3, 0] = False
+    grid, tensors = hj.Grid(shape, 0.3, mask=inside), jnp.asarray(random_spd(rng, shape))
+    density = jnp.asarray(rng.uniform(1, 2, shape))
+    boundary, elements = ("periodic", "neumann", "dirichlet")[:d], (8, *(n - 1 for n in shape[1:]))
+    potential = jnp.asarray(rng.uniform(1, 2, elements))
+    weights = rng.standard_normal((2, 3**d, *shape))
+
+    def loss(tensors, density, potential):
+        pencil = hj.assemble(hj.TensorField(grid, tensors), boundary, density=density, potential=potential)
+        both = jnp.stack([pencil.stiffness.coefficients, pencil.mass.coefficients])
+        return jnp.sum(weights * both), (both, pencil.volume)
+
+    found = []
+    for planes in (8, 3):
+        monkeypatch.setattr(integrals, "_AT_ONCE", planes * 4**d * math.prod(elements[1:]))
+        found.append(jax.value_and_grad(loss, argnums=(0, 1, 2), has_aux=True)(tensors, density, potential))
+    for whole, in_slabs in zip(*map(jax.tree.leaves, found), strict=True):
+        np.testing.assert_allclose(in_slabs, whole, atol=1e-12 * np.abs(whole).max())
 
 
 def test_volume_counts_eliminated_nodes_and_lumping_keeps_it(rng):

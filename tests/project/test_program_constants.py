@@ -69,3 +69,43 @@ def test_the_filter_has_no_constants_of_the_grids_size():
 @pytest.mark.slow
 def test_block_lanczos_has_nothing_but_the_elimination_tree_for_constants():
     assert bytes_of_constants(pairs_by(BlockLanczos()), (SIDE, SIDE)) < FEW + 80 * SIDE**2
+
+
+MANY, CUBE = 10_000, (64,) * 3
+"""So many vectors on so few nodes have 2.6·10⁹ entries, as 156 vectors on 256³ nodes have; nothing is computed."""
+
+
+def axes(program: Any) -> Iterator[int]:
+    """Go through the lengths of the axes of all arrays in a program."""
+    program = getattr(program, "jaxpr", program)
+    for equation in program.eqns:
+        for variable in (*equation.invars, *equation.outvars):
+            yield from getattr(variable.aval, "shape", ())
+        for value in equation.params.values():
+            for inner in value if isinstance(value, tuple | list) else (value,):
+                if hasattr(inner, "eqns") or hasattr(inner, "jaxpr"):
+                    yield from axes(inner)
+
+
+def stored(constant):
+    """Return the part of a constant that JAX puts into a program: of values that repeat along an axis, the first."""
+    return constant[tuple(slice(1) if stride == 0 else slice(None) for stride in constant.strides)]
+
+
+def signature_of_many(tensors):
+    pairs = hj.eigenpairs(hj.TensorField(hj.Grid(CUBE), tensors), MANY, solver=ChebyshevFilter())
+    return hj.hks(pairs, np.array([0.5, 1.0], tensors.dtype))
+
+
+@pytest.mark.parametrize("derivative", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_arrays_of_more_than_2_to_the_31_entries_are_never_flattened(derivative):
+    """JAX's indices along an axis are 32-bit integers unless 64-bit numbers are enabled."""
+    function = signature_of_many
+    if derivative:
+        function = jax.grad(lambda tensors: jax.numpy.sum(signature_of_many(tensors) ** 2))
+    with jax.enable_x64(False):
+        program = jax.make_jaxpr(function)(jax.ShapeDtypeStruct((*CUBE, 3, 3), np.float32))
+    assert max(axes(program)) < 2**31 < MANY * math.prod(CUBE)
+    known = [stored(np.asarray(constant)) for constant in constants(program)]
+    of_nodes = [constant for constant in known if constant.shape != (MANY, MANY)]
+    assert max(constant.nbytes for constant in of_nodes) <= 8 * MANY < math.prod(CUBE)  # not even a mask

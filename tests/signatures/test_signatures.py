@@ -11,6 +11,7 @@ from fields import flat, random_spd, turning
 from scipy.linalg import expm
 
 import hks_jax as hj
+from hks_jax.signatures import contractions
 from hks_jax.signatures.truncation import beyond, beyond_by_weyl, median_of_shares
 
 
@@ -28,6 +29,18 @@ def pairs(field) -> hj.Eigenpairs:
 
 
 TIMES = [0.1, 0.5, 2.0]
+
+
+def test_a_signature_in_parts_is_the_whole_signature_and_its_derivative(rng, monkeypatch):
+    """The squares of many eigenvectors are computed for some nodes at a time; the last part overlaps another."""
+    weights, vectors, tangent = (jnp.asarray(rng.standard_normal(shape)) for shape in ((3, 5), (5, 11), (5, 11)))
+    monkeypatch.setattr(contractions, "_SQUARES", 20)
+    value, change = jax.jvp(lambda x: contractions.Diagonal().weighted(weights, x), (vectors,), (tangent,))
+    np.testing.assert_allclose(value, weights @ vectors**2, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(change, 2 * weights @ (vectors * tangent), rtol=1e-13, atol=1e-13)
+    found = jax.grad(lambda x: jnp.sum(jnp.sin(contractions.Diagonal().weighted(weights, x))))(vectors)
+    expected = jax.grad(lambda x: jnp.sum(jnp.sin(jnp.matmul(weights, x**2, precision="highest"))))(vectors)
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
 
 
 def kernel_by_matrix_exponential(pairs, t) -> np.ndarray:

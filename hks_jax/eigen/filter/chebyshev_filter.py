@@ -129,10 +129,23 @@ def _iterate(pencil: Pencil, plan: FilterPlan, max_rounds: int, report: Report) 
         coarse, grid, rounds = grid, grids.pop(), _COARSE_ROUNDS
         state = grid.from_coarse(coarse, state)
     state = _converge(grid, indistinct(pencil, grid.high.dtype), state, max_rounds, report)
-    slabs, vectors = grid.slabs, state.vectors[: plan.wanted]
-    vectors = vectors.reshape(plan.wanted, *(grid.pencil.shape if slabs is None else slabs.padded_shape))
-    vectors = vectors if slabs is None else slabs.join(vectors, axis=1)
-    return state.values[: plan.wanted], pencil.space.restrict(vectors)
+    values, vectors = _wanted(grid, state)
+    del state  # its vectors, while `restrict` makes further ones
+    space = pencil.space
+    if space.n_dof < vectors.shape[1]:
+        vectors = space.restrict(vectors.reshape(-1, *space.node_shape))
+    return values, vectors
+
+
+# Outside `jit`, each operation on its own would copy all vectors.
+@jax.jit
+def _wanted(grid: GridFilter, state: FilterState) -> Pairs:
+    """Return the wanted pairs on all nodes of the grid."""
+    slabs, k = grid.slabs, grid.plan.wanted
+    vectors = state.vectors[:k]
+    if slabs is not None:
+        vectors = slabs.join(vectors.reshape(k, *slabs.padded_shape), axis=1).reshape(k, -1)
+    return state.values[:k], vectors
 
 
 _compiled = jax.jit(_iterate, static_argnames=("plan", "max_rounds", "report"))
