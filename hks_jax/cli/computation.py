@@ -231,8 +231,26 @@ def domain_of_volume(volume: TensorVolume, settings: Settings, image: str = "") 
     return Domain(volume, field, describe_input(volume), (image,), {}, volume.tensors, of_tensors, volume)
 
 
-def compute_pairs(domain: OfVolume | OfMesh, settings: Settings, progress: Progress) -> Solved:
-    """Compute the eigenpairs of a domain; raise ComputationError unless all converge."""
+def solver_of(
+    settings: Settings, pencil: hj.Pencil | hj.MirrorPencil, k: int, keep_spare: bool
+) -> str | hj.Eigensolver:
+    """Return the filter with the tolerance of the command line if it is the chosen solver, or else the given name.
+
+    The two problems of "mean" may get different solvers by name, so the name is handed on.
+    """
+    solver = choose_solvers(settings.solver, pencil, k)[0]
+    if not isinstance(solver, hj.ChebyshevFilter):
+        return settings.solver
+    return replace(solver, tolerance=_TOLERANCE, keep_spare=keep_spare)
+
+
+def compute_pairs(
+    domain: OfVolume | OfMesh, settings: Settings, progress: Progress, keep_spare: bool = False
+) -> Solved:
+    """Compute the eigenpairs of a domain; raise ComputationError unless all converge.
+
+    ``keep_spare`` states whether eigenpairs of similar tensors will start from them.
+    """
     boundary, field = settings.boundary, domain.field
     if isinstance(field, hj.TensorField):
         inside, nodes = field.grid.inside, f"{int(field.grid.inside.sum())} of {field.grid.size} nodes"
@@ -250,12 +268,9 @@ def compute_pairs(domain: OfVolume | OfMesh, settings: Settings, progress: Progr
     assert dimension is not None
     k = default_k(dimension, unknowns) if settings.k is None else settings.k
     _tell_of_resolution(k, pencil, domain, settings, progress)
-    solver = choose_solvers(settings.solver, pencil, k)[0]
-    with progress.stage("eigenpairs", f"{k} of {unknowns} by {solver.name}"):
-        # The two problems of "mean" may get different solvers by name, so the name is handed on.
-        loose = isinstance(solver, hj.ChebyshevFilter)
-        chosen = replace(solver, tolerance=_TOLERANCE) if loose else settings.solver
-        pairs = hj.eigenpairs(pencil, k, solver=chosen, progress=progress.update)
+    solver = solver_of(settings, pencil, k, keep_spare)
+    with progress.stage("eigenpairs", f"{k} of {unknowns} by {choose_solvers(solver, pencil, k)[0].name}"):
+        pairs = hj.eigenpairs(pencil, k, solver=solver, progress=progress.update)
         jax.block_until_ready(pairs.eigenvalues)
     if not np.asarray(pairs.converged).all():
         raise ComputationError(pairs.messages()[0])

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -303,6 +304,8 @@ class PencilEigenpairs(Eigenpairs, eqx.Module):
         frame: (k, n_dof) the values of `vectors`, but with a derivative that excludes rotations of eigenvectors among
             themselves, which are singular at multiple eigenvalues. Derivatives of signatures include the effect of such
             rotations by divided differences.
+        spare: the vectors after the k-th that a `ChebyshevFilter` with ``keep_spare`` has computed, which do not count
+            as converged. `eigenpairs` uses them to start from these pairs. None for other solvers.
     """
 
     eigenvalues: Float[Array, " k"]
@@ -317,6 +320,7 @@ class PencilEigenpairs(Eigenpairs, eqx.Module):
     frame: Float[Array, "k n_dof"]
     pencil: Pencil
     solver_name: str = eqx.field(static=True)
+    spare: Float[Array, "spare n_dof"] | None = None
 
     @view
     def problems(self) -> "tuple[PencilEigenpairs, ...]":
@@ -361,7 +365,8 @@ class PencilEigenpairs(Eigenpairs, eqx.Module):
         if pencil is self.pencil:
             return self
         frame = self.space.transfer(self.frame, pencil.space)
-        return eqx.tree_at(lambda p: (p.frame, p.pencil), self, (frame, pencil))
+        spare = None if self.spare is None else self.space.transfer(self.spare, pencil.space)
+        return replace(self, frame=frame, pencil=pencil, spare=spare)
 
 
 @numpy_where_known()

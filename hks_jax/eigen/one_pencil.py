@@ -22,7 +22,13 @@ from hks_jax.linear.symmetric_pencil import SymmetricPencil, tabulated
 
 
 def pairs_of_pencil(
-    pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw: bool, report: Report
+    pencil: Pencil,
+    solver: Eigensolver,
+    k: int,
+    extra: int,
+    throw: bool,
+    report: Report,
+    start: PencilEigenpairs | None = None,
 ) -> PencilEigenpairs:
     """Return the k lowest pairs and, if ``extra`` = 1, the next eigenvalue. See `solved` for ``throw``."""
     # Iterative solvers compute on all nodes, so that all masks share compiled code.
@@ -40,7 +46,10 @@ def pairs_of_pencil(
             f"k: got {k}, for which {k + extra} pairs are needed (one more shows where the spectrum is cut); the "
             f"{solver.name} solver computes at most {most} of {n_dof} pairs. Use a smaller k or the dense solver"
         )
-    return _pairs(pencil, solved(solver, pencil, k, extra, throw, report), solver).on(given)
+    rows = None
+    if start is not None and start.spare is not None:
+        rows = start.space.transfer(jnp.concatenate([start.frame, start.spare]), pencil.space)
+    return _pairs(pencil, solved(solver, pencil, k, extra, throw, report, rows), solver).on(given)
 
 
 def _with_balance(pencil: Pencil) -> Pencil:
@@ -58,7 +67,7 @@ def _single_on_host(values: Any, args: Any) -> bool:
 
 def _pairs(pencil: Pencil, found: tuple[Any, ...], solver: Eigensolver) -> PencilEigenpairs:
     """Return the `PencilEigenpairs` of a pencil, given the result of `solved`."""
-    values, frame, following, bound = found
+    values, frame, following, bound, spare = found
     known, double = pencil.null_space is not None, solver.in_double
     constants = jax.lax.stop_gradient((pencil, frame, values, following))
     matrices = tabulated(SymmetricPencil(constants[0].stiffness, constants[0].mass))
@@ -83,6 +92,7 @@ def _pairs(pencil: Pencil, found: tuple[Any, ...], solver: Eigensolver) -> Penci
         frame=frame,
         pencil=pencil,
         solver_name=solver.name,
+        spare=spare,
     )
 
 
