@@ -16,7 +16,7 @@ from hks_jax.cli.options import add_metric, add_signature, add_solving, defaults
 from hks_jax.cli.parsing import Times, parse_times
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.tensor_checks import Interpolation, MetricChoice, OperatorChoice
-from hks_jax.eigen.automatic import choose_solvers
+from hks_jax.eigen.automatic import choose_for_similar, choose_solvers
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.boundary import BoundarySpec, default_boundary, unreached_sides
 from hks_jax.io import TensorVolume
@@ -231,26 +231,21 @@ def domain_of_volume(volume: TensorVolume, settings: Settings, image: str = "") 
     return Domain(volume, field, describe_input(volume), (image,), {}, volume.tensors, of_tensors, volume)
 
 
-def solver_of(
-    settings: Settings, pencil: hj.Pencil | hj.MirrorPencil, k: int, keep_spare: bool
-) -> str | hj.Eigensolver:
+def solver_of(settings: Settings, pencil: hj.Pencil | hj.MirrorPencil, k: int, first: bool) -> str | hj.Eigensolver:
     """Return the filter with the tolerance of the command line if it is the chosen solver, or else the given name.
 
-    The two problems of "mean" may get different solvers by name, so the name is handed on.
+    The two problems of "mean" may get different solvers by name, so the name is handed on. ``first`` states whether
+    eigenpairs of similar pencils will start from these.
     """
-    solver = choose_solvers(settings.solver, pencil, k)[0]
+    many = first and settings.solver == "auto"
+    solver = choose_for_similar(pencil, k) if many else choose_solvers(settings.solver, pencil, k)[0]
     if not isinstance(solver, hj.ChebyshevFilter):
         return settings.solver
-    return replace(solver, tolerance=_TOLERANCE, keep_spare=keep_spare)
+    return replace(solver, tolerance=_TOLERANCE, keep_spare=first)
 
 
-def compute_pairs(
-    domain: OfVolume | OfMesh, settings: Settings, progress: Progress, keep_spare: bool = False
-) -> Solved:
-    """Compute the eigenpairs of a domain; raise ComputationError unless all converge.
-
-    ``keep_spare`` states whether eigenpairs of similar tensors will start from them.
-    """
+def compute_pairs(domain: OfVolume | OfMesh, settings: Settings, progress: Progress, first: bool = False) -> Solved:
+    """Compute the eigenpairs of a domain; raise ComputationError unless all converge. See `solver_of` for ``first``."""
     boundary, field = settings.boundary, domain.field
     if isinstance(field, hj.TensorField):
         inside, nodes = field.grid.inside, f"{int(field.grid.inside.sum())} of {field.grid.size} nodes"
@@ -268,7 +263,7 @@ def compute_pairs(
     assert dimension is not None
     k = default_k(dimension, unknowns) if settings.k is None else settings.k
     _tell_of_resolution(k, pencil, domain, settings, progress)
-    solver = solver_of(settings, pencil, k, keep_spare)
+    solver = solver_of(settings, pencil, k, first)
     with progress.stage("eigenpairs", f"{k} of {unknowns} by {choose_solvers(solver, pencil, k)[0].name}"):
         pairs = hj.eigenpairs(pencil, k, solver=solver, progress=progress.update)
         jax.block_until_ready(pairs.eigenvalues)

@@ -5,6 +5,7 @@ with --points a curve over the times for each point.
 
 examples:
   hks-jax plot out/hks.npz -o panels.png --times auto:4 --quantiles 0.02,0.9
+  hks-jax plot out/hks.npz -o volume.png --through 60,70,14 --range shared
   hks-jax plot out/hks.npz -o curves.pdf --points -22,5 24,5
 """
 
@@ -18,12 +19,14 @@ import numpy as np
 from hks_jax.cli import options
 from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import Done
-from hks_jax.cli.parsing import axis_and_index, colour_range, file_in_folder, parse_times, point, quantiles
+from hks_jax.cli.parsing import axis_and_index, colour_range, file_in_folder, parse_times, point, quantiles, voxel
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import sliced
 from hks_jax.io.result import Result
 
 USAGE = "RESULT -o PICTURE"
+MIDDLE = "middle"
+"""The value of ``--through`` without a voxel."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -46,6 +49,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=axis_and_index,
         metavar="AXIS=N",
         help="slice of a volume, such as z=14 (default: the middle along z)",
+    )
+    parser.add_argument(
+        "--through",
+        nargs="?",
+        const=MIDDLE,
+        type=voxel,
+        metavar="I,J,K",
+        help="three orthogonal slices of a volume through this voxel, or the nearest one with a value, instead of one "
+        "slice (without I,J,K: a voxel in the middle)",
     )
     parser.add_argument(
         "--points",
@@ -149,7 +161,7 @@ def _choose_times(result: Result, args: argparse.Namespace) -> np.ndarray:
 
 
 def _panels(result: Result, args: argparse.Namespace) -> Any:
-    from hks_jax.plot import hks_panels, middle_node
+    from hks_jax.plot import hks_panels, middle_node, volume_panels
     from hks_jax.plot.signature import (
         LEAST_RANGE,
         anatomy,
@@ -168,7 +180,11 @@ def _panels(result: Result, args: argparse.Namespace) -> Any:
     near = result.near_rim if signature else None
     beside = anatomy(result) if signature else {}
     place = ""
-    if volume.dimension == 3:
+    if volume.dimension == 2:
+        refuse(args, ("slice", "through"), f"{args.result} is a slice, with two axes; leave this option out")
+    elif args.through is not None:
+        refuse(args, ("slice",), "--through draws three slices; leave one of the options out")
+    else:
         axis, index = args.slice or ("z", middle_node(result.grid.inside)[2])
         volume = sliced(volume, axis, index)
         across = "xyz".index(axis)
@@ -176,8 +192,6 @@ def _panels(result: Result, args: argparse.Namespace) -> Any:
         near = None if near is None else near.take(index, 1 + across)
         beside = {name: scalar.take(index, across) for name, scalar in beside.items()}
         place = f"slice {axis} = {index}"
-    else:
-        refuse(args, ("slice",), f"{args.result} is a slice, with two axes; leave this option out")
     drawn = volume.inside & np.isfinite(values).all(axis=0)
     if not drawn.any():
         raise ValueError(f"--slice: no value of {args.result} in this slice is finite; choose another slice")
@@ -194,7 +208,10 @@ def _panels(result: Result, args: argparse.Namespace) -> Any:
         style |= {"centre": centre if style["vmin"] is None else None, "shared_range": args.range == "shared"}
         style |= {"quantiles": args.quantiles or (0.0, 1.0), "least_range": LEAST_RANGE}
     titles = titles_of(result, args.unit_of_t) if signature else None
-    return hks_panels(
+    if isinstance(args.through, tuple):
+        style["node"] = [index - part.start for index, part in zip(args.through, box, strict=True)]
+    panels: Any = hks_panels if volume.dimension == 2 else volume_panels
+    return panels(
         values[:, *box],
         result.times if result.times.size else [0.0],
         plane,

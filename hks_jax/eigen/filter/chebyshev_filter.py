@@ -40,7 +40,7 @@ _LEAST_NODES = 6
 _LARGE = 1 << 21
 """The total number of entries of the vectors above which every block reports progress, not only every round."""
 
-Pairs = tuple[Float[Array, " k"], Float[Array, "k n_dof"]]
+Pairs = tuple[Float[Array, " k"], Float[Array, "m n_dof"]]
 
 
 class ChebyshevFilter(Eigensolver[Pencil]):
