@@ -34,8 +34,8 @@ _ON_HOST = 1 << 22
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 2, 3, 4, 5))
 def solved(
-    solver: Eigensolver, pencil: Pencil, k: int, extra: int, throw: bool, report: Report, start: Rows | None = None
-) -> tuple[Values, Vectors, Scalar, Scalar, Vectors | None]:
+    solver: Eigensolver, pencil: Pencil, k: int, extra: int, throw: bool, report: Report, start: Array | None = None
+) -> tuple[Values, Vectors, Scalar, Scalar, Array | None]:
     """Return the k lowest eigenvalues, the frame of their eigenvectors, the next eigenvalue, a certified bound, and the
     vectors beyond the k-th if the solver keeps them.
 
@@ -98,7 +98,7 @@ class _Known(NamedTuple):
     functions: Rows  # the first k vectors, because slicing ``vectors`` would copy the slice
 
 
-def _computed(solver: Eigensolver, pencil: Pencil, k: int, report: Report, start: Rows | None) -> RawPairs:
+def _computed(solver: Eigensolver, pencil: Pencil, k: int, report: Report, start: Array | None) -> RawPairs:
     values, vectors, bound = one_by_one(_by_solver, (solver, k, report), pencil, start)
     if pencil.null_space is not None and pencil.n_null:
         values, vectors = _with_null_modes(pencil.mass, pencil.null_space.vectors, values, vectors)
@@ -195,7 +195,7 @@ def _tangents(adjoint: Adjoint, on_failure: OnFailure, known: _Known, change: Sy
 
 
 # `one_by_one` needs the same function object in every call; so the next two functions are at module level.
-def _by_solver(solver: Eigensolver, k: int, report: Report, pencil: SymmetricPencil, start: Rows | None) -> RawPairs:
+def _by_solver(solver: Eigensolver, k: int, report: Report, pencil: SymmetricPencil, start: Array | None) -> RawPairs:
     lowest: Any = solver.lowest
     return lowest(pencil, k, report, start) if solver.starts else lowest(pencil, k, report)
 
