@@ -25,8 +25,6 @@ from hks_jax.cli.reading import sliced
 from hks_jax.io.result import Result
 
 USAGE = "RESULT -o PICTURE"
-MIDDLE = "middle"
-"""The value of ``--through`` without a voxel."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -53,7 +51,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--through",
         nargs="?",
-        const=MIDDLE,
+        const=(),
         type=voxel,
         metavar="I,J,K",
         help="three orthogonal slices of a volume through this voxel, or the nearest one with a value, instead of one "
@@ -127,8 +125,8 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
             "times and the normalisation raw or flat. Leave this option out"
         )
     chosen = _choose_times(result, args)
-    influence = {n: a[chosen] for n, a in result.arrays.items() if n == "influence"}
-    arrays = {**result.arrays, **influence}
+    at_times = {n: a[chosen] for n, a in result.arrays.items() if n in ("influence", "z", "deviation", "bias")}
+    arrays = {**result.arrays, **at_times}
     result = replace(
         result, values=result.values[chosen], times=result.times[chosen[: result.times.size]], arrays=arrays
     )
@@ -177,7 +175,7 @@ def _panels(result: Result, args: argparse.Namespace) -> Any:
 
     signature = result.name == "hks"
     values, volume, title = result.values, result.volume, args.title or (caption(result) if signature else "")
-    near = result.near_rim if signature else None
+    near, z = (result.near_rim, result.z) if signature else (None, None)
     beside = anatomy(result) if signature else {}
     place = ""
     if volume.dimension == 2:
@@ -189,7 +187,7 @@ def _panels(result: Result, args: argparse.Namespace) -> Any:
         volume = sliced(volume, axis, index)
         across = "xyz".index(axis)
         values = values.take(index, 1 + across)
-        near = None if near is None else near.take(index, 1 + across)
+        near, z = (None if each is None else each.take(index, 1 + across) for each in (near, z))
         beside = {name: scalar.take(index, across) for name, scalar in beside.items()}
         place = f"slice {axis} = {index}"
     drawn = volume.inside & np.isfinite(values).all(axis=0)
@@ -208,7 +206,7 @@ def _panels(result: Result, args: argparse.Namespace) -> Any:
         style |= {"centre": centre if style["vmin"] is None else None, "shared_range": args.range == "shared"}
         style |= {"quantiles": args.quantiles or (0.0, 1.0), "least_range": LEAST_RANGE}
     titles = titles_of(result, args.unit_of_t) if signature else None
-    if isinstance(args.through, tuple):
+    if args.through:
         style["node"] = [index - part.start for index, part in zip(args.through, box, strict=True)]
     panels: Any = hks_panels if volume.dimension == 2 else volume_panels
     return panels(
@@ -220,6 +218,7 @@ def _panels(result: Result, args: argparse.Namespace) -> Any:
         beside={name: np.where(drawn, scalar, np.nan)[box] for name, scalar in beside.items()},
         suptitle="\n".join([": ".join(filter(None, (place, title))), *([] if args.title else notes)]).strip(),
         hatched=None if hatched is None else hatched[:, *box],
+        z=None if z is None else z[:, *box],
         orientation=placed(volume, box, args.view),
         **style,
     )
