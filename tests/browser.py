@@ -114,7 +114,9 @@ class Browser:
         """Open a file and wait until it is there."""
         self.send("Page.navigate", url=Path(path).resolve().as_uri())
         end = time.monotonic() + 60
-        while self.run("document.readyState") != "complete" or self.run("location.href") == "about:blank":
+        ready = "document.readyState === 'complete' && location.href !== 'about:blank' && "
+        ready += "document.querySelector('main[aria-busy]') === null"
+        while not self.run(ready):
             if time.monotonic() > end:
                 raise TimeoutError(f"{path} did not load")
             time.sleep(0.02)

@@ -16,7 +16,7 @@ from hks_jax.cli.options import add_metric, add_signature, add_solving, defaults
 from hks_jax.cli.parsing import Times, parse_times
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.tensor_checks import Interpolation, MetricChoice, OperatorChoice
-from hks_jax.eigen.automatic import choose_solvers
+from hks_jax.eigen.automatic import choose_for_similar, choose_solvers
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.boundary import BoundarySpec, default_boundary, unreached_sides
 from hks_jax.io import TensorVolume
@@ -231,8 +231,21 @@ def domain_of_volume(volume: TensorVolume, settings: Settings, image: str = "") 
     return Domain(volume, field, describe_input(volume), (image,), {}, volume.tensors, of_tensors, volume)
 
 
-def compute_pairs(domain: OfVolume | OfMesh, settings: Settings, progress: Progress) -> Solved:
-    """Compute the eigenpairs of a domain; raise ComputationError unless all converge."""
+def solver_of(settings: Settings, pencil: hj.Pencil | hj.MirrorPencil, k: int, first: bool) -> str | hj.Eigensolver:
+    """Return the filter with the tolerance of the command line if it is the chosen solver, or else the given name.
+
+    The two problems of "mean" may get different solvers by name, so the name is handed on. ``first`` states whether
+    eigenpairs of similar pencils will start from these.
+    """
+    many = first and settings.solver == "auto"
+    solver = choose_for_similar(pencil, k) if many else choose_solvers(settings.solver, pencil, k)[0]
+    if not isinstance(solver, hj.ChebyshevFilter):
+        return settings.solver
+    return replace(solver, tolerance=_TOLERANCE, keep_spare=first)
+
+
+def compute_pairs(domain: OfVolume | OfMesh, settings: Settings, progress: Progress, first: bool = False) -> Solved:
+    """Compute the eigenpairs of a domain; raise ComputationError unless all converge. See `solver_of` for ``first``."""
     boundary, field = settings.boundary, domain.field
     if isinstance(field, hj.TensorField):
         inside, nodes = field.grid.inside, f"{int(field.grid.inside.sum())} of {field.grid.size} nodes"
@@ -250,12 +263,9 @@ def compute_pairs(domain: OfVolume | OfMesh, settings: Settings, progress: Progr
     assert dimension is not None
     k = default_k(dimension, unknowns) if settings.k is None else settings.k
     _tell_of_resolution(k, pencil, domain, settings, progress)
-    solver = choose_solvers(settings.solver, pencil, k)[0]
-    with progress.stage("eigenpairs", f"{k} of {unknowns} by {solver.name}"):
-        # The two problems of "mean" may get different solvers by name, so the name is handed on.
-        loose = isinstance(solver, hj.ChebyshevFilter)
-        chosen = replace(solver, tolerance=_TOLERANCE) if loose else settings.solver
-        pairs = hj.eigenpairs(pencil, k, solver=chosen, progress=progress.update)
+    solver = solver_of(settings, pencil, k, first)
+    with progress.stage("eigenpairs", f"{k} of {unknowns} by {choose_solvers(solver, pencil, k)[0].name}"):
+        pairs = hj.eigenpairs(pencil, k, solver=solver, progress=progress.update)
         jax.block_until_ready(pairs.eigenvalues)
     if not np.asarray(pairs.converged).all():
         raise ComputationError(pairs.messages()[0])

@@ -60,6 +60,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     options.add_meshes(parser)
     options.add_signature(parser)
     options.add_noise(parser)
+    parser.add_argument(
+        "--checkpoint",
+        type=Path,
+        metavar="FILE",
+        help="file that is written after every four noisy maps; if the file exists, error bars continue from it",
+    )
     options.add_view(parser)
     options.add_rim(parser)
     parser.add_argument(
@@ -71,24 +77,27 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def writes(args: argparse.Namespace) -> list[Path]:
     """Return the files that the command may write."""
-    return [args.output / name for name in ("hks.*", REPORT, *[PAIRS] * args.save_pairs)]
+    checkpoint = [] if args.checkpoint is None else [args.checkpoint]
+    return [*(args.output / name for name in ("hks.*", REPORT, *[PAIRS] * args.save_pairs)), *checkpoint]
 
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
     check_noise(args)
+    if args.noise is None:
+        refuse(args, ("checkpoint",), "this option is for error bars; add --noise or leave it out")
     domain, settings, solved = read_source(args, progress)
     if isinstance(domain.place, TensorVolume) and domain.place.dimension == 2:
         refuse(args, ("through",), "this option is for a volume; leave it out for a slice")
     noise = noise_of(domain, Reading.of(args), args.draws, progress)  # before the eigenpairs, because it may fail
-    solved = solved or compute_pairs(domain, settings, progress)
+    solved = solved or compute_pairs(domain, settings, progress, first=noise is not None)
     kept = [args.output / PAIRS] * args.save_pairs
     for path in kept:  # the eigenpairs are written first, because later steps may fail
         with progress.stage("writing", str(path)):
             for file in of_earlier(args.output, np.asarray(solved.pairs.eigenvalues), progress):
                 file.unlink(missing_ok=True)
             write_pairs(path, solved, progress.warnings)
-    result = signature_of(solved, noise, progress)
+    result = signature_of(solved, noise, progress, args.checkpoint)
     from hks_jax.plot import signature_panels
 
     draw = partial(signature_panels, result, view=args.view, through=args.through, show_rim=args.show_rim)

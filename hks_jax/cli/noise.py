@@ -3,6 +3,7 @@
 import argparse
 import warnings
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -11,7 +12,7 @@ import numpy as np
 
 import hks_jax as hj
 from hks_jax.checks import require_count
-from hks_jax.cli.computation import OfMesh, OfVolume, Solved, automatic_times, result_of
+from hks_jax.cli.computation import OfMesh, OfVolume, Solved, automatic_times, result_of, solver_of
 from hks_jax.cli.parsing import Times
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import Reading, read_volume
@@ -46,11 +47,11 @@ def check_noise(args: argparse.Namespace) -> None:
             raise ValueError(f"--noise: got --method {args.method}; expected spectral. Leave one of the options out")
 
 
-def signature_of(solved: Solved, noise: Noise | None, progress: Progress) -> Result:
+def signature_of(solved: Solved, noise: Noise | None, progress: Progress, checkpoint: Path | None = None) -> Result:
     """Compute the signature of a domain from its eigenpairs, with error bars unless `noise` is None."""
     settings = solved.settings
     if noise is not None:
-        bars, maps, interior, times = _error_bars(solved, noise, progress)
+        bars, maps, interior, times = _error_bars(solved, noise, progress, checkpoint)
         settings = replace(settings, times=Times(times, settings.times.automatic))
     result = result_of(solved._replace(settings=settings), progress)
     if noise is None:
@@ -63,6 +64,7 @@ def signature_of(solved: Solved, noise: Noise | None, progress: Progress) -> Res
         "draws": bars.draws,
         "sampling_error": bars.sampling_error,
         "indefinite": float(bars.indefinite),
+        "raised": float(bars.raised),
         "signal_to_noise": ratio.tolist(),
         "signal_to_noise_with_rim": np.asarray(bars.signal_to_noise).tolist(),
         "interior": (interior.reshape(len(ratio), -1).sum(axis=1) / nodes).tolist(),
@@ -130,7 +132,7 @@ def noise_of(domain: OfVolume | OfMesh, reading: Reading, draws: int, progress: 
 
 
 def _error_bars(
-    solved: Solved, noise: Noise, progress: Progress
+    solved: Solved, noise: Noise, progress: Progress, checkpoint: Path | None
 ) -> tuple[hj.Uncertainty, np.ndarray, np.ndarray, tuple[float, ...]]:
     """Return error bars, the sampled noise (n_draws, n_times, *shape), the interior (n_times, *shape), and the times.
 
@@ -144,17 +146,25 @@ def _error_bars(
     of_tensors, wanted = domain.of_tensors, settings.times.automatic
     times = settings.times.explicit or automatic_times(pairs, _CANDIDATES * wanted)
     maps: list[np.ndarray] = []
+    solver = solver_of(settings, pairs.pencil, pairs.k, first=True)
+    starts, start = isinstance(solver, hj.ChebyshevFilter), pairs
 
     def signature(D: Any) -> Any:
+        nonlocal start
         assert settings.boundary is not None
-        field = of_tensors(D)
-        return hj.hks(hj.eigenpairs(field, pairs.k, settings.boundary, settings.solver), times, settings.normalisation)
+        found = hj.eigenpairs(of_tensors(D), pairs.k, settings.boundary, solver, start=start if starts else None)
+        if starts and start.problems[0].spare is None:  # the first call is for the measured tensors
+            start = found
+        if starts and not np.asarray(found.converged).all():
+            progress.warn(f"error bars are not accurate: in a noisy map, {found.messages()[0]}")
+        return hj.hks(found, times, settings.normalisation)
 
     with progress.stage("error bars", f"{noise.draws} noisy maps"), warnings.catch_warnings():
         warnings.simplefilter("ignore", hj.AccuracyWarning)  # some warnings concern candidate times that are not chosen
         tensors = domain.tensors.astype(settings.dtype)
         in_volume = domain.volume is not None and domain.volume is not domain.place  # JAX cannot trace the sampling
-        more: dict[str, Any] = {"draws": noise.draws, "compiled": not in_volume}
+        # The filter compiles its rounds itself, and outside `jit` it solves for fewer pairs of each problem.
+        more: dict[str, Any] = {"draws": noise.draws, "compiled": not (in_volume or starts), "checkpoint": checkpoint}
         more |= {"each": lambda one: maps.append(np.asarray(one, np.float32)), "progress": progress.update}
         bars = hj.uncertainty(signature, tensors, noise.of_tensors, method="resample", **more)
         interior = np.isfinite(np.asarray(bars.value))

@@ -5,6 +5,7 @@ with --points a curve over the times for each point.
 
 examples:
   hks-jax plot out/hks.npz -o panels.png --times auto:4 --quantiles 0.02,0.9
+  hks-jax plot out/hks.npz -o volume.png --through 60,70,14 --range shared
   hks-jax plot out/hks.npz -o curves.pdf --points -22,5 24,5
 """
 
@@ -18,7 +19,7 @@ import numpy as np
 from hks_jax.cli import options
 from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import Done
-from hks_jax.cli.parsing import axis_and_index, colour_range, file_in_folder, parse_times, point, quantiles
+from hks_jax.cli.parsing import axis_and_index, colour_range, file_in_folder, parse_times, point, quantiles, voxel
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import sliced
 from hks_jax.io.result import Result
@@ -46,6 +47,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=axis_and_index,
         metavar="AXIS=N",
         help="slice of a volume, such as z=14 (default: the middle along z)",
+    )
+    parser.add_argument(
+        "--through",
+        nargs="?",
+        const=(),
+        type=voxel,
+        metavar="I,J,K",
+        help="three orthogonal slices of a volume through this voxel, or the nearest one with a value, instead of one "
+        "slice (without I,J,K: a voxel in the middle)",
     )
     parser.add_argument(
         "--points",
@@ -115,8 +125,8 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
             "times and the normalisation raw or flat. Leave this option out"
         )
     chosen = _choose_times(result, args)
-    influence = {n: a[chosen] for n, a in result.arrays.items() if n == "influence"}
-    arrays = {**result.arrays, **influence}
+    at_times = {n: a[chosen] for n, a in result.arrays.items() if n in ("influence", "z", "deviation", "bias")}
+    arrays = {**result.arrays, **at_times}
     result = replace(
         result, values=result.values[chosen], times=result.times[chosen[: result.times.size]], arrays=arrays
     )
@@ -149,7 +159,7 @@ def _choose_times(result: Result, args: argparse.Namespace) -> np.ndarray:
 
 
 def _panels(result: Result, args: argparse.Namespace) -> Any:
-    from hks_jax.plot import hks_panels, middle_node
+    from hks_jax.plot import hks_panels, middle_node, volume_panels
     from hks_jax.plot.signature import (
         LEAST_RANGE,
         anatomy,
@@ -165,19 +175,21 @@ def _panels(result: Result, args: argparse.Namespace) -> Any:
 
     signature = result.name == "hks"
     values, volume, title = result.values, result.volume, args.title or (caption(result) if signature else "")
-    near = result.near_rim if signature else None
+    near, z = (result.near_rim, result.z) if signature else (None, None)
     beside = anatomy(result) if signature else {}
     place = ""
-    if volume.dimension == 3:
+    if volume.dimension == 2:
+        refuse(args, ("slice", "through"), f"{args.result} is a slice, with two axes; leave this option out")
+    elif args.through is not None:
+        refuse(args, ("slice",), "--through draws three slices; leave one of the options out")
+    else:
         axis, index = args.slice or ("z", middle_node(result.grid.inside)[2])
         volume = sliced(volume, axis, index)
         across = "xyz".index(axis)
         values = values.take(index, 1 + across)
-        near = None if near is None else near.take(index, 1 + across)
+        near, z = (None if each is None else each.take(index, 1 + across) for each in (near, z))
         beside = {name: scalar.take(index, across) for name, scalar in beside.items()}
         place = f"slice {axis} = {index}"
-    else:
-        refuse(args, ("slice",), f"{args.result} is a slice, with two axes; leave this option out")
     drawn = volume.inside & np.isfinite(values).all(axis=0)
     if not drawn.any():
         raise ValueError(f"--slice: no value of {args.result} in this slice is finite; choose another slice")
@@ -194,7 +206,10 @@ def _panels(result: Result, args: argparse.Namespace) -> Any:
         style |= {"centre": centre if style["vmin"] is None else None, "shared_range": args.range == "shared"}
         style |= {"quantiles": args.quantiles or (0.0, 1.0), "least_range": LEAST_RANGE}
     titles = titles_of(result, args.unit_of_t) if signature else None
-    return hks_panels(
+    if args.through:
+        style["node"] = [index - part.start for index, part in zip(args.through, box, strict=True)]
+    panels: Any = hks_panels if volume.dimension == 2 else volume_panels
+    return panels(
         values[:, *box],
         result.times if result.times.size else [0.0],
         plane,
@@ -203,6 +218,7 @@ def _panels(result: Result, args: argparse.Namespace) -> Any:
         beside={name: np.where(drawn, scalar, np.nan)[box] for name, scalar in beside.items()},
         suptitle="\n".join([": ".join(filter(None, (place, title))), *([] if args.title else notes)]).strip(),
         hatched=None if hatched is None else hatched[:, *box],
+        z=None if z is None else z[:, *box],
         orientation=placed(volume, box, args.view),
         **style,
     )

@@ -57,6 +57,12 @@ def choose_solvers(solver: str | Eigensolver, pencil: AnyPencil, k: int) -> list
     return [choose_solver(solver, part, share) for part in pencil.parts]
 
 
+def choose_for_similar(pencil: AnyPencil, k: int) -> Eigensolver:
+    """Return the solver that ``"auto"`` chooses for the first of many similar pencils: never a solver on the host."""
+    part, share = pencil.parts[0], -(-k // len(pencil.parts))
+    return Dense() if _is_small(part, share) else _in_jax(part, share)
+
+
 def choose_for_fit(pencil: AnyPencil, k: int) -> Eigensolver:
     """Return the solver that ``"auto"`` chooses in a fit.
 
@@ -67,16 +73,26 @@ def choose_for_fit(pencil: AnyPencil, k: int) -> Eigensolver:
     return fitting if n > _SMALL and k + 20 <= fitting.max_pairs(n) else Dense()
 
 
-def _automatic(pencil: Pencil, k: int) -> Eigensolver:
-    n, volume = pencil.space.n_dof, pencil.space.dimension == 3
-    if n <= _SMALL or 4 * k > n:
-        return Dense()
+def _is_small(pencil: Pencil, k: int) -> bool:
+    return pencil.space.n_dof <= max(_SMALL, 4 * k - 1)
+
+
+def _in_jax(pencil: Pencil, k: int) -> Eigensolver:
     exact, laplacian = pencil.stiffness.dtype == np.float64, pencil.measured and pencil.bounded
     # In 3D factorisations have much fill-in, and in float32 they lose too many digits.
+    volume = pencil.space.dimension == 3
     matrix_free = laplacian and isinstance(pencil.stiffness, StencilOperator) and (volume or not exact)
     candidates = ([ChebyshevFilter()] if matrix_free else []) + [BlockLanczos()]
     # The driver computes one additional pair.
-    ours = next((solver for solver in candidates if k < solver.max_pairs(n)), Dense())
+    return next((solver for solver in candidates if k < solver.max_pairs(pencil.space.n_dof)), Dense())
+
+
+def _automatic(pencil: Pencil, k: int) -> Eigensolver:
+    n, volume = pencil.space.n_dof, pencil.space.dimension == 3
+    if _is_small(pencil, k):
+        return Dense()
+    exact, laplacian = pencil.stiffness.dtype == np.float64, pencil.measured and pencil.bounded
+    ours = _in_jax(pencil, k)
     if not is_concrete_on_cpu(jax.lax.stop_gradient((pencil.stiffness, pencil.mass))):
         return ours
     if not laplacian:

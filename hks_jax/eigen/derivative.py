@@ -34,9 +34,10 @@ _ON_HOST = 1 << 22
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 2, 3, 4, 5))
 def solved(
-    solver: Eigensolver, pencil: Pencil, k: int, extra: int, throw: bool, report: Report
-) -> tuple[Values, Vectors, Scalar, Scalar]:
-    """Return the k lowest eigenvalues, the frame of their eigenvectors, the next eigenvalue, and a certified bound.
+    solver: Eigensolver, pencil: Pencil, k: int, extra: int, throw: bool, report: Report, start: Array | None = None
+) -> tuple[Values, Vectors, Scalar, Scalar, Array | None]:
+    """Return the k lowest eigenvalues, the frame of their eigenvectors, the next eigenvalue, a certified bound, and the
+    vectors beyond the k-th if the solver keeps them.
 
     The frame is equal to the eigenvectors, but its derivative excludes rotations of the k eigenvectors among
     themselves, which `hks_jax.eigen.rotations` adds. The next eigenvalue is infinite unless ``extra`` = 1. The solver
@@ -44,8 +45,8 @@ def solved(
     bound as constants. Derivatives whose linear solves do not converge are NaN, and raise an error if ``throw`` is set,
     or else cause a warning if values are concrete.
     """
-    values, vectors, complete_below = _computed(solver, pencil, k + extra, report)
-    return *_cut(values, vectors, k), complete_below
+    values, vectors, complete_below = _computed(solver, pencil, k + extra, report, start)
+    return *_cut(values, vectors, k), complete_below, vectors[k:] if len(vectors) > k + extra else None
 
 
 # Let fᵢ = (dK − λᵢ dM) φᵢ, called the force. From Kφᵢ = λᵢMφᵢ and φᵢᵀMφⱼ = δᵢⱼ it follows that
@@ -64,10 +65,12 @@ def solved(
 def _solved_jvp(
     solver: Eigensolver, k: int, extra: int, throw: bool, report: Report, primals: Any, changes: Any
 ) -> tuple[tuple, tuple]:
-    pencil, change = first_order_only(primals[0]), changes[0]
+    pencil, start, change = first_order_only(primals[0]), primals[1], changes[0]
     n_dof, adjoint = pencil.size, solver.adjoint
     spare = max(extra, min(solver.guards(k, n_dof), solver.max_pairs(n_dof) - k))
-    values, vectors, complete_below = _computed(solver, pencil, k + spare, report)
+    values, vectors, complete_below = _computed(solver, pencil, k + spare, report, start)
+    kept = vectors[k:] if len(vectors) > k + spare else None
+    vectors = vectors if kept is None else vectors[: k + spare]
     eigenvalues, functions, following = _cut(values, vectors, k)
     origin, solves = jnp.zeros((), values.dtype), _solves(pencil, k, len(values))
     if solves and pencil.null_space is None:  # linear solves need K ⪰ 0
@@ -80,8 +83,8 @@ def _solved_jvp(
     on_failure: OnFailure = "error" if throw else "nothing" if is_traced(primals) else "warning"
     known, settings = _Known(prepared, pencil, origin, values, vectors, functions), (adjoint, on_failure)
     tangents = linear_program(_tangents, settings, (known,), change, (eigenvalues, functions), _by_numpy)
-    constants = following if extra else jnp.full_like(following, jnp.inf), complete_below
-    return (eigenvalues, functions, *constants), (*tangents, *map(jnp.zeros_like, constants))
+    constants = following if extra else jnp.full_like(following, jnp.inf), complete_below, kept
+    return (eigenvalues, functions, *constants), (*tangents, *jax.tree.map(jnp.zeros_like, constants))
 
 
 class _Known(NamedTuple):
@@ -95,8 +98,8 @@ class _Known(NamedTuple):
     functions: Rows  # the first k vectors, because slicing ``vectors`` would copy the slice
 
 
-def _computed(solver: Eigensolver, pencil: Pencil, k: int, report: Report) -> RawPairs:
-    values, vectors, bound = one_by_one(_by_solver, (solver, k, report), pencil)
+def _computed(solver: Eigensolver, pencil: Pencil, k: int, report: Report, start: Array | None) -> RawPairs:
+    values, vectors, bound = one_by_one(_by_solver, (solver, k, report), pencil, start)
     if pencil.null_space is not None and pencil.n_null:
         values, vectors = _with_null_modes(pencil.mass, pencil.null_space.vectors, values, vectors)
     return values, vectors, bound
@@ -192,8 +195,9 @@ def _tangents(adjoint: Adjoint, on_failure: OnFailure, known: _Known, change: Sy
 
 
 # `one_by_one` needs the same function object in every call; so the next two functions are at module level.
-def _by_solver(solver: Eigensolver, k: int, report: Report, pencil: SymmetricPencil) -> RawPairs:
-    return solver.lowest(pencil, k, report)
+def _by_solver(solver: Eigensolver, k: int, report: Report, pencil: SymmetricPencil, start: Array | None) -> RawPairs:
+    lowest: Any = solver.lowest
+    return lowest(pencil, k, report, start) if solver.starts else lowest(pencil, k, report)
 
 
 def _prepare(adjoint: Adjoint, k: int, pencil: SymmetricPencil, values: Values) -> Any:

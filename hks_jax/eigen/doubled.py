@@ -176,7 +176,12 @@ def _split(xp: Any, order: Any, kept: Any, sizes: tuple[int, ...]) -> Any:
 
 
 def pairs_of_doubled(
-    pencil: MirrorPencil, solver: str | Eigensolver, k: int, throw: bool, report: Report
+    pencil: MirrorPencil,
+    solver: str | Eigensolver,
+    k: int,
+    throw: bool,
+    report: Report,
+    starts: Sequence[PencilEigenpairs | None],
 ) -> DoubledEigenpairs:
     """Return the k lowest pairs of a doubled domain, from its problems, each solved for one more eigenvalue.
 
@@ -186,7 +191,10 @@ def pairs_of_doubled(
     """
     parts, limits = pencil.parts, _limits(pencil, k)
     traced = is_traced(jax.lax.stop_gradient(pencil))
-    wanted = limits if traced else [min(limit, _share(pencil, k)) for limit in limits]
+    wanted = limits
+    if not traced:
+        before = [0 if start is None else start.k for start in starts]
+        wanted = [min(limit, max(_share(pencil, k), own)) for limit, own in zip(limits, before, strict=True)]
     solvers = choose_solvers(solver, pencil, k)
 
     def solve(number: int, report: Report) -> PencilEigenpairs:
@@ -194,7 +202,7 @@ def pairs_of_doubled(
         extra = min(1, part.size - wanted[number])
         if limit + extra > own.max_pairs(part.size):  # all pairs of a small problem may be needed
             own = Dense(own.tolerance)
-        return pairs_of_pencil(part, own, wanted[number], extra, throw, report)
+        return pairs_of_pencil(part, own, wanted[number], extra, throw, report, starts[number])
 
     solved = [solve(i, _of_problem(report, i, len(parts))) for i in range(len(parts))]
     while not traced:

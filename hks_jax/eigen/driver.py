@@ -1,5 +1,6 @@
 """The driver: `eigenpairs` assembles matrices, chooses a solver, and truncates the spectrum."""
 
+from collections.abc import Sequence
 from typing import Any, get_args
 
 import jax
@@ -9,7 +10,7 @@ from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import require_static
 from hks_jax.eigen.automatic import choose_solver
 from hks_jax.eigen.doubled import pairs_of_doubled
-from hks_jax.eigen.eigenpairs import RESULTS, Eigenpairs
+from hks_jax.eigen.eigenpairs import RESULTS, Eigenpairs, PencilEigenpairs, require_pairs
 from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
 from hks_jax.eigen.multiplets import SPARE, MultipletChoice
 from hks_jax.eigen.one_pencil import pairs_of_pencil
@@ -34,6 +35,7 @@ def eigenpairs(
     progress: Report | None = None,
     *,
     quadrature: Quadrature = "gauss",
+    start: Eigenpairs | None = None,
 ) -> Eigenpairs:
     """Compute the k lowest eigenpairs of the Laplace–Beltrami operator, or of any symmetric pencil Kφ = λMφ.
 
@@ -62,6 +64,9 @@ def eigenpairs(
             did not converge are NaN, and concrete values cause a warning.
         progress: a function such as ``print`` that receives short texts during a computation with concrete values.
         quadrature: the quadrature rule for a field or mesh; see `assemble`.
+        start: pairs of similar tensors on the same nodes, with the same k and boundary condition, from which
+            ``hks_jax.ChebyshevFilter(keep_spare=True)`` starts, if it also computed them. They are constants in
+            derivatives; other solvers ignore them.
 
     Returns:
         The pairs with residuals and convergence flags. The eigenvalue of a null vector is exactly zero. (Each component
@@ -69,7 +74,8 @@ def eigenpairs(
 
     Raises:
         ValueError: k is out of range; the solver, boundary or mass is unknown; the solver does not support the pencil;
-            the stiffness does not annihilate the given null vectors; the mass is not positive definite.
+            the stiffness does not annihilate the given null vectors; the mass is not positive definite; ``start`` has
+            other nodes or another number of problems.
         RuntimeError: the computation failed and ``throw`` is set.
 
     Warns:
@@ -92,7 +98,7 @@ def eigenpairs(
             f"k: got {k}; expected an integer from 1 to {total}, the number of degrees of freedom. "
             "Use a smaller k or a finer grid"
         )
-    pairs = _pairs_of(pencil, int(number), total, solver, multiplet, throw, progress or silent)
+    pairs = _pairs_of(pencil, int(number), total, solver, multiplet, throw, progress or silent, _starts(start, pencil))
     known = jax.lax.stop_gradient(pairs)
     if is_traced(known.eigenvalues):
         return known.result.error_if(pairs, known.result != RESULTS.successful) if throw else pairs
@@ -154,6 +160,17 @@ def eigsh(
     return eigenpairs(K if M is None else (K, M), k, solver=solver or "auto", throw=throw, progress=progress)
 
 
+def _starts(start: Eigenpairs | None, pencil: AnyPencil) -> Sequence[PencilEigenpairs | None]:
+    """Return the pairs from which each problem starts."""
+    if start is None:
+        return [None] * len(pencil.parts)
+    problems = jax.lax.stop_gradient(require_pairs(start).problems)
+    own, known = ([each.space.node_shape for each in of] for of in (pencil.parts, problems))
+    if own != known:
+        raise ValueError(f"start: got pairs on nodes of the shapes {known}; expected {own}, one for each problem")
+    return problems
+
+
 def _pairs_of(
     pencil: AnyPencil,
     k: int,
@@ -162,15 +179,16 @@ def _pairs_of(
     multiplet: MultipletChoice,
     throw: bool,
     report: Report,
+    starts: Sequence[PencilEigenpairs | None],
 ) -> Eigenpairs:
     size = min(k + SPARE, total) if multiplet == "complete" else k
     pairs: Eigenpairs
     if isinstance(pencil, MirrorPencil):
-        pairs = pairs_of_doubled(pencil, solver, size, throw, report)
+        pairs = pairs_of_doubled(pencil, solver, size, throw, report, starts)
     else:
         chosen = choose_solver(solver, pencil, size)
         extra = min(1, total - size)  # the next eigenvalue shows whether k cuts a multiple eigenvalue
-        pairs = pairs_of_pencil(pencil, chosen, size, extra, throw, report)
+        pairs = pairs_of_pencil(pencil, chosen, size, extra, throw, report, *starts)
         found = jax.lax.stop_gradient(pairs)
         doubtful = solver == "auto" and isinstance(chosen, ShiftInvert) and not pencil.bounded
         if doubtful and (found.unconfirmed or not found.converged.all()):  # for example, if k cuts a large multiplet

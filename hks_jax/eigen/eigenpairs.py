@@ -303,6 +303,8 @@ class PencilEigenpairs(Eigenpairs, eqx.Module):
         frame: (k, n_dof) the values of `vectors`, but with a derivative that excludes rotations of eigenvectors among
             themselves, which are singular at multiple eigenvalues. Derivatives of signatures include the effect of such
             rotations by divided differences.
+        spare: the vectors after the k-th that a `ChebyshevFilter` with ``keep_spare`` has computed, which do not count
+            as converged. `eigenpairs` uses them to start from these pairs. None for other solvers.
     """
 
     eigenvalues: Float[Array, " k"]
@@ -317,6 +319,7 @@ class PencilEigenpairs(Eigenpairs, eqx.Module):
     frame: Float[Array, "k n_dof"]
     pencil: Pencil
     solver_name: str = eqx.field(static=True)
+    spare: Float[Array, "spare n_dof"] | None = None
 
     @view
     def problems(self) -> "tuple[PencilEigenpairs, ...]":

@@ -14,7 +14,7 @@ from hks_jax.eigen.derivative import solved
 from hks_jax.eigen.eigenpairs import UNCERTAIN, PencilEigenpairs
 from hks_jax.eigen.quality import allowed_residuals, indistinct, largest, largest_of, measure_pairs, measured_on_host
 from hks_jax.eigen.solver import Dense, Eigensolver, Report
-from hks_jax.fem.box import from_box, in_box
+from hks_jax.fem.box import from_box, in_box, to_box
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import MatrixSpace
 from hks_jax.linear.host_matrices import balanced, near_zero
@@ -22,7 +22,13 @@ from hks_jax.linear.symmetric_pencil import SymmetricPencil, tabulated
 
 
 def pairs_of_pencil(
-    pencil: Pencil, solver: Eigensolver, k: int, extra: int, throw: bool, report: Report
+    pencil: Pencil,
+    solver: Eigensolver,
+    k: int,
+    extra: int,
+    throw: bool,
+    report: Report,
+    start: PencilEigenpairs | None = None,
 ) -> PencilEigenpairs:
     """Return the k lowest pairs and, if ``extra`` = 1, the next eigenvalue. See `solved` for ``throw``."""
     given, pencil = pencil, pencil if isinstance(solver, Dense) else in_box(pencil, k + extra)
@@ -39,8 +45,14 @@ def pairs_of_pencil(
             f"k: got {k}, for which {k + extra} pairs are needed (one more shows where the spectrum is cut); the "
             f"{solver.name} solver computes at most {most} of {n_dof} pairs. Use a smaller k or the dense solver"
         )
-    pairs = _pairs(pencil, solved(solver, pencil, k, extra, throw, report), solver)
-    return replace(pairs, frame=from_box(pairs.frame, pencil.space, given.space), pencil=given)
+    rows = None
+    if start is not None and start.spare is not None:
+        rows = start.space.transfer(jnp.concatenate([start.frame, start.spare]), given.space)
+        rows = to_box(rows, given.space, pencil.space)
+    pairs = _pairs(pencil, solved(solver, pencil, k, extra, throw, report, rows), solver)
+    frame = from_box(pairs.frame, pencil.space, given.space)
+    spare = None if pairs.spare is None else from_box(pairs.spare, pencil.space, given.space)
+    return replace(pairs, frame=frame, spare=spare, pencil=given)
 
 
 def _with_balance(pencil: Pencil) -> Pencil:
@@ -58,7 +70,7 @@ def _single_on_host(values: Any, args: Any) -> bool:
 
 def _pairs(pencil: Pencil, found: tuple[Any, ...], solver: Eigensolver) -> PencilEigenpairs:
     """Return the `PencilEigenpairs` of a pencil, given the result of `solved`."""
-    values, frame, following, bound = found
+    values, frame, following, bound, spare = found
     known, double = pencil.null_space is not None, solver.in_double
     constants = jax.lax.stop_gradient((pencil, frame, values, following))
     matrices = tabulated(SymmetricPencil(constants[0].stiffness, constants[0].mass))
@@ -83,6 +95,7 @@ def _pairs(pencil: Pencil, found: tuple[Any, ...], solver: Eigensolver) -> Penci
         frame=frame,
         pencil=pencil,
         solver_name=solver.name,
+        spare=spare,
     )
 
 

@@ -23,7 +23,7 @@ from hks_jax.linear.symmetric_pencil import P, SymmetricPencil
 _FAR = 30
 """The largest distance of an origin below the wanted eigenvalues, in units of the spread of these eigenvalues."""
 
-RawPairs = tuple[Float[Array, " k"], Float[Array, "k n_dof"], Float[Array, ""]]
+RawPairs = tuple[Float[Array, " k"], Float[Array, "m n_dof"], Float[Array, ""]]
 
 Report = Callable[[str], Any]
 """A function that receives short texts on the progress of a computation. Some texts are of the class `Status`."""
@@ -64,6 +64,7 @@ class Eigensolver(eqx.Module, Generic[P]):
 
     Attributes:
         name: the name of the method in reports.
+        starts: whether `lowest` has the argument ``start``: approximate eigenvectors (m, n_dof) to start from, or None.
         in_double: whether the method computes in float64 if values are concrete and on a CPU, whatever their dtype.
         adjoint: the linear solver for derivatives. The default, `FactorisedAdjoint`, needs a pencil that it can
             factorise.
@@ -72,6 +73,7 @@ class Eigensolver(eqx.Module, Generic[P]):
     """
 
     name: ClassVar[str]
+    starts: ClassVar[bool] = False
     in_double: ClassVar[bool] = False
     tolerance: eqx.AbstractVar[float]
     adjoint: Adjoint = eqx.field(default=FactorisedAdjoint(), static=True, kw_only=True)
@@ -84,7 +86,8 @@ class Eigensolver(eqx.Module, Generic[P]):
         """Return the k lowest eigenvalues (ascending), M-orthonormal eigenvectors (as rows), and a certified bound.
 
         None of the k lowest eigenvalues is missing below the bound. Pairs that were not found are NaN, and the bound is
-        NaN if there is no certificate. The method works under `jit` and `vmap`; outside `jit`, it may report progress.
+        NaN if there is no certificate. Further vectors may follow the k eigenvectors; `PencilEigenpairs.spare` keeps
+        them. The method works under `jit` and `vmap`; outside `jit`, it may report progress.
         """
 
     def require(self, pencil: P) -> None:

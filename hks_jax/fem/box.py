@@ -71,12 +71,20 @@ def in_box(pencil: Pencil, k: int) -> Pencil:
     return replace(pencil, stiffness=stiffness, mass=mass, space=whole, null_space=nulls, row_sums=sums)
 
 
+def to_box(vectors: Float[Array, "k n_dof"], space: FunctionSpace, boxed: FunctionSpace) -> Float[Array, "k n_box"]:
+    """Return vectors in the space of a pencil ``boxed``, which is that of the given space or its `in_box`."""
+    return vectors if boxed == space else _in_its_box(space).transfer(vectors, boxed)
+
+
 def from_box(vectors: Float[Array, "k n_box"], boxed: FunctionSpace, space: FunctionSpace) -> Float[Array, "k n_dof"]:
     """Return eigenvectors in a space, given those of a pencil ``boxed``, which is that of the space or its `in_box`."""
-    if boxed == space:
-        return vectors
+    return vectors if boxed == space else boxed.transfer(vectors, _in_its_box(space))
+
+
+def _in_its_box(space: FunctionSpace) -> GridSpace:
+    """Return the space with the same unknowns on the nodes of the box."""
     assert isinstance(space, GridSpace)
-    return boxed.transfer(vectors, space.around[1])
+    return space.around[1]
 
 
 # The eigenvalue of the separate equations is the largest quotient Kᵢᵢ/Mᵢᵢ of the free nodes, a Rayleigh quotient, and

@@ -14,7 +14,10 @@ from hks_jax.eigen.eigenpairs import Eigenpairs, PencilEigenpairs
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
 from hks_jax.storage import load_npz, write_npz
 
-ARRAYS = "vectors", *(f.name for f in fields(PencilEigenpairs) if f.name not in ("frame", "pencil", "solver_name"))
+ARRAYS = (
+    "vectors",
+    *(f.name for f in fields(PencilEigenpairs) if f.name not in ("frame", "pencil", "solver_name", "spare")),
+)
 """The attributes of `hks_jax.Eigenpairs` that are saved as arrays."""
 _FAR = 1e-3
 """The residual, relative to the largest known eigenvalue, above which pairs count as pairs of another pencil."""

@@ -118,6 +118,7 @@ def volume_panels(
     titles: Sequence[str] | None = None,
     unit: str = "",
     length_unit: str = "",
+    shared_range: bool = False,
     limits: Sequence[tuple[float, float]] | None = None,
     beside: Mapping[str, Real[ArrayLike, "nx ny nz"]] | None = None,
     path: str | os.PathLike[str] | None = None,
@@ -138,6 +139,7 @@ def volume_panels(
         titles: a title for each time, by default “t = …”.
         unit: the unit of t, which titles show after the value of t.
         length_unit: the unit of the coordinates.
+        shared_range: whether all times use the colours of one range. The three slices always do.
         limits: the values of the first and the last colour for each time.
         beside: other scalars (*shape,) by title, drawn in grey after the last time.
         path: the file in which to save the figure, if given.
@@ -161,7 +163,7 @@ def volume_panels(
     t = checked_times(times, grid.shape, values=values, z=z, hatched=hatched)
     titles = panel_titles(t, titles, unit)
     volumes = [masked("values", each, grid) for each in np.ma.asarray(values)]
-    colours = panel_colours(volumes, limits, **kwargs)
+    colours = panel_colours(volumes, limits, shared_range, **kwargs)
     others = [masked(f"beside: {title}", each, grid) for title, each in (beside or {}).items()]
     volumes, colours = [*volumes, *others], [*colours, *panel_colours(others, **BESIDE)]
     titles, n = [*titles, *(beside or {})], len(volumes)

@@ -36,6 +36,8 @@ class Uncertainty(eqx.Module):
         smear: the change of the value if the smoothed tensors are smoothed once more, an estimate of the change that
             smoothing causes; None without smoothing.
         indefinite: the share of the measured tensors that a sample of the noise, added as a whole, makes indefinite.
+        raised: the share of the noisy tensors whose diffusivity in some direction was raised to half of the measured
+            diffusivity, because the noise is too large there.
         sampling_error: the relative standard deviation of ``deviation``; 0 if ``deviation`` is exact to first order.
         method: ``"resample"``, ``"linear"`` or ``"exact"``.
         draws: the number of noisy tensor fields at which the function was evaluated.
@@ -51,6 +53,7 @@ class Uncertainty(eqx.Module):
     beyond_linear: Any
     smear: Any
     indefinite: Float[Array, ""]
+    raised: Float[Array, ""]
     sampling_error: float = eqx.field(static=True)
     method: str = eqx.field(static=True)
     draws: int = eqx.field(static=True)
@@ -235,6 +238,8 @@ class Uncertainty(eqx.Module):
         }[self.method]
         sure = f", with a relative error of {self.sampling_error:.0%}" if self.sampling_error else ""
         lines = [f"{how}{sure}; {self.draws} noisy maps"]
+        if self.raised > 0:
+            lines.append(f"tensors raised to half of the measured diffusivity: {float(self.raised):.2%} of each map")
         size = jax.tree.map(jnp.divide, self.bias, self.deviation)
         part = jax.tree.map(jnp.divide, self._correction, self.bias)
         for name, each in (

@@ -187,14 +187,43 @@ def test_plot_of_a_volume(tmp_path, capsys):
     volume = TensorVolume(np.broadcast_to(np.eye(3), (6, 5, 4, 3, 3)), (1.0,) * 3, (0.0,) * 3)
     values = np.random.default_rng(0).random((2, 6, 5, 4))
     path = save(tmp_path / "hks.npz", values, volume, name="hks", extra={"times": [1.0, 2.0]})
-    for more in ([], ["--slice", "x=2"], ["--points", "1,2,3"]):
+    for more in ([], ["--slice", "x=2"], ["--through"], ["--through", "1,2,3"], ["--points", "1,2,3"]):
         assert main(["plot", str(path), "-o", str(tmp_path / "p.png"), *more]) == 0
     capsys.readouterr()
     for more, words in (
         (["--slice", "x=6"], "--slice: index: got x = 6; expected 0 … 5"),
         (["--points", "1,2"], "expected 3 coordinates"),
+        (["--slice", "x=2", "--through", "1,2,3"], "--slice: --through draws three slices"),
     ):
         assert error_of(capsys, main(["plot", str(path), "-o", str(tmp_path / "p.png"), *more]), words) == 2
+
+
+def test_three_slices_have_the_colours_of_all_times(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr("hks_jax.plot.save_figure", lambda figure, *_, **__: drawn.append(figure))
+    volume = TensorVolume(np.broadcast_to(np.eye(3), (6, 5, 4, 3, 3)), (1.0,) * 3, (0.0,) * 3, affine=np.eye(4))
+    values = np.random.default_rng(0).random((3, 6, 5, 4))
+    path = save(tmp_path / "hks.npz", values, volume, name="hks", extra={"times": [1.0, 2.0, 3.0], "z": 3 * values})
+    main(
+        [
+            "plot",
+            str(path),
+            "-o",
+            str(tmp_path / "p.png"),
+            "--through",
+            "1,2,3",
+            "--times",
+            "1",
+            "3",
+            "--range",
+            "shared",
+            "-q",
+        ]
+    )
+    images = [ax.images[0] for ax in drawn[0].axes if ax.images]
+    assert len(images) == 6
+    assert len({image.get_clim() for image in images}) == 1
+    assert {"L", "R", "P", "A", "I", "S"} <= {text.get_text() for ax in drawn[0].axes for text in ax.texts}
 
 
 @pytest.mark.parametrize(

@@ -188,6 +188,48 @@ def test_pairs_equal_the_dense_ones(name):
     assert any("of 25 pairs" in text for text in rounds)
 
 
+@pytest.mark.parametrize("boundary", ["mean", pytest.param("dirichlet", marks=pytest.mark.slow)])
+def test_pairs_of_similar_tensors_are_a_start(rng, boundary):
+    shape, k, told = (12, 11, 10), 16, []
+    grid, tensors = hj.Grid(shape, 0.1, mask=masked(shape)), random_spd(rng, shape, 0.2)
+    solver = hj.ChebyshevFilter(block=8, tolerance=1e-4, keep_spare=True)
+
+    def solve(tensors, start=None):
+        told.clear()
+        field = hj.TensorField(grid, tensors)
+        pairs = hj.eigenpairs(field, k, boundary, solver, start=start, progress=told.append)
+        assert pairs.converged.all()
+        return pairs, sum("round" in text for text in told)
+
+    first, _ = solve(tensors)
+    again, rounds = solve(tensors, first)
+    assert rounds == 0
+    np.testing.assert_allclose(again.eigenvalues, first.eigenvalues, rtol=1e-9, atol=1e-9)
+    other = tensors * (1 + 0.03 * rng.standard_normal(shape)[..., None, None])
+    cold, many = solve(other)
+    started, few = solve(other, first)
+    assert few <= 0.7 * many
+    np.testing.assert_allclose(started.eigenvalues, cold.eigenvalues, rtol=1e-6, atol=1e-6)
+    with pytest.raises(ValueError, match="start: got pairs on nodes of the shapes"):
+        hj.eigenpairs(hj.TensorField(hj.Grid((12, 11)), random_spd(rng, (12, 11), 0.2)), k, solver=solver, start=first)
+
+
+@pytest.mark.slow
+def test_a_start_is_a_constant_under_jit_and_in_derivatives(rng):
+    shape, k, t = (9, 8, 10), 8, jnp.array([0.15])
+    solver, grid = hj.ChebyshevFilter(block=4, keep_spare=True), hj.Grid(shape, 0.1)
+    tensors = jnp.asarray(random_spd(rng, shape, 0.3))
+
+    def loss(tensors, start):
+        pairs = hj.eigenpairs(hj.TensorField(grid, tensors), k, solver=solver, start=start)
+        return jnp.sum(hj.hks(pairs, t) ** 2)
+
+    start = hj.eigenpairs(hj.TensorField(grid, tensors), k, solver=solver)
+    plain, started = (jax.jit(jax.value_and_grad(loss))(1.1 * tensors, each) for each in (None, start))
+    np.testing.assert_allclose(started[0], plain[0], rtol=1e-9)
+    np.testing.assert_allclose(started[1], plain[1], atol=1e-7 * float(jnp.abs(plain[1]).max()))
+
+
 @pytest.mark.slow
 def test_multiplicities_of_a_cube_are_complete():
     n, k = 16, 29

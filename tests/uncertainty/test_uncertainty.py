@@ -11,6 +11,7 @@ from fields import random_spd
 
 import hks_jax as hj
 from hks_jax.domain import spd
+from hks_jax.uncertainty.propagate import _floored
 from hks_jax.uncertainty.significance import normal_score
 
 
@@ -427,26 +428,49 @@ def test_smoothing_lowers_noise_and_tells_what_it_smears(rng):
     assert np.corrcoef(shift.ravel(), np.asarray(smooth.smear)[4:-4].ravel())[0, 1] > 0.95
 
 
+def test_noise_lowers_no_diffusivity_by_more_than_half(rng):
+    """Relative to the measured tensor, a noisy tensor has no eigenvalue below ½; tensors with less noise stay."""
+    D = random_spd(rng, (30, 20), 0.1).reshape(-1, 2, 2)
+    change = 0.3 * rng.standard_normal(D.shape)
+    given = D + change + change.swapaxes(-1, -2)
+
+    def ratios(tensors):
+        pairs = zip(np.asarray(tensors), D, strict=True)
+        return np.stack([scipy.linalg.eigh(one, of, eigvals_only=True) for one, of in pairs])
+
+    noisy, share = _floored(jnp.asarray(D), jnp.asarray(given))
+    before = ratios(given)
+    low = before[:, 0] < 0.5
+    assert 0.05 < low.mean() < 0.95
+    np.testing.assert_allclose(ratios(noisy), np.maximum(before, 0.5), rtol=1e-9)
+    np.testing.assert_allclose(share, low.mean(), rtol=1e-12)
+    np.testing.assert_array_equal(noisy[~low], given[~low])
+
+
 @pytest.mark.slow
 def test_an_interrupted_computation_goes_on(rng, tmp_path):
-    D, told = random_spd(rng, (3, 3), 0.1), []
+    D, told, samples, stored = random_spd(rng, (3, 3), 0.1), [], [], {"checkpoint": tmp_path / "c.npz"}
     settings = {"noise": hj.TensorNoise.relative(D, 0.05), "draws": 22, "method": "resample"}
     whole = hj.uncertainty(spd.determinant, D, **settings)
 
     def stop(text):
         told.append(text)
-        if len(told) == 3:
+        if len(told) == 11:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        hj.uncertainty(spd.determinant, D, **settings, progress=stop, checkpoint=tmp_path / "c.npz")
-    told += ["", ""]
-    resumed = hj.uncertainty(spd.determinant, D, **settings, progress=stop, checkpoint=tmp_path / "c.npz")
-    assert told[2] == "12 of 24 noisy maps"
-    assert told[5:] == ["12 of 24 noisy maps", "16 of 24 noisy maps", "20 of 24 noisy maps", "24 of 24 noisy maps"]
+        hj.uncertainty(spd.determinant, D, **settings, progress=stop, each=samples.append, **stored)
+    assert told[-1] == "11 of 24 noisy maps"
+    assert len(samples) == 6
+    again = []
+    resumed = hj.uncertainty(spd.determinant, D, **settings, progress=told.append, each=again.append, **stored)
+    assert told[11:] == [f"{i} of 24 noisy maps" for i in range(9, 25)]
+    assert all(0 <= text.seconds_left < 100 for text in told[11:])
+    np.testing.assert_array_equal(again[:6], samples)
+    np.testing.assert_allclose(np.mean(np.square(again), axis=0), whole.deviation**2, rtol=1e-12)
     np.testing.assert_allclose(resumed.deviation, whole.deviation, rtol=1e-14)
     with pytest.raises(ValueError, match="belongs to another computation"):
-        hj.uncertainty(spd.determinant, 2 * D, **settings, checkpoint=tmp_path / "c.npz")
+        hj.uncertainty(spd.determinant, 2 * D, **settings, each=samples.append, **stored)
 
 
 def test_bad_input_is_named(rng):

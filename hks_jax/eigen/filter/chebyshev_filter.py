@@ -40,7 +40,7 @@ _LEAST_NODES = 6
 _LARGE = 1 << 21
 """The total number of entries of the vectors above which every block reports progress, not only every round."""
 
-Pairs = tuple[Float[Array, " k"], Float[Array, "k n_dof"]]
+Pairs = tuple[Float[Array, " k"], Float[Array, "m n_dof"]]
 
 
 class ChebyshevFilter(Eigensolver[Pencil]):
@@ -58,6 +58,7 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         max_rounds: the maximal number of rounds on the finest grid.
         mesh: the devices, as a `jax.sharding.Mesh` with one axis. Each device filters some of the vectors, and stores
             all vectors on a part of the grid (docs/devices.md). None means one device.
+        keep_spare: whether the pairs keep the additional vectors, a third of k, which ``start`` of `eigenpairs` needs.
 
     Examples:
         >>> flat = hj.TensorField(hj.Grid((17, 17), 1 / 16), np.tile(np.eye(2), (17, 17, 1, 1)))
@@ -67,11 +68,13 @@ class ChebyshevFilter(Eigensolver[Pencil]):
     """
 
     name: ClassVar[str] = "chebyshev-filter"
+    starts: ClassVar[bool] = True
     tolerance: float = eqx.field(default=1e-8, static=True)
     block: int = eqx.field(default=32, static=True)
     max_rounds: int = eqx.field(default=60, static=True)
     adjoint: Adjoint = eqx.field(default=FilteredAdjoint(), static=True, kw_only=True)
     mesh: Mesh | None = eqx.field(default=None, static=True)
+    keep_spare: bool = eqx.field(default=False, static=True)
 
     def __check_init__(self) -> None:
         require_count("block", self.block)
@@ -90,14 +93,20 @@ class ChebyshevFilter(Eigensolver[Pencil]):
                 "vectors"
             )
 
-    def lowest(self, pencil: Pencil, k: int, report: Report = silent) -> RawPairs:
-        """Return the k lowest eigenpairs; the bound is NaN, because the method has no certificate."""
+    def lowest(
+        self, pencil: Pencil, k: int, report: Report = silent, start: Float[Array, "m n_dof"] | None = None
+    ) -> RawPairs:
+        """Return the k lowest eigenpairs; the bound is NaN, because the method has no certificate.
+
+        The iteration starts from the vectors ``start`` if they are enough, otherwise on coarser grids.
+        """
         moved, origin = from_lower_bound(pencil)
         assert isinstance(moved, Pencil)
         assert isinstance(moved.space, GridSpace)
         plan = self.plan(k, moved.space)
         compute = _compiled if is_traced(moved) else _iterate
-        values, vectors = compute(moved, plan, self.max_rounds, report)
+        start = None if start is None or len(start) < plan.size else start[: plan.size]
+        values, vectors = compute(moved, plan, self.max_rounds, report, start, plan.size if self.keep_spare else k)
         values = values if pencil.null_space is not None else values + origin
         return values, vectors, jnp.asarray(jnp.nan, values.dtype)
 
@@ -117,10 +126,22 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         return FilterPlan(k, size, self.block, space.n_null, self.tolerance, mesh)
 
 
-def _iterate(pencil: Pencil, plan: FilterPlan, max_rounds: int, report: Report) -> Pairs:
-    grids = [_replicated(plan.mesh, GridFilter(nodal, upper_end(nodal), plan)) for nodal in _nested(pencil, plan)]
+def _iterate(
+    pencil: Pencil,
+    plan: FilterPlan,
+    max_rounds: int,
+    report: Report,
+    start: Float[Array, "m n_dof"] | None,
+    returned: int,
+) -> Pairs:
+    nested = _nested(pencil, plan) if start is None else [nodal_pencil(pencil)]
+    grids = [_replicated(plan.mesh, GridFilter(nodal, upper_end(nodal), plan)) for nodal in nested]
     grid = grids.pop()
-    state, rounds = grid.from_random(pencil.volume), _FIRST_ROUNDS
+    if start is None:
+        state = grid.from_random(pencil.volume)
+    else:
+        state = grid.from_rows(pencil.space.extend(start, outside=0.0).reshape(plan.size, -1))
+    rounds = _FIRST_ROUNDS
     while grids:
         for _ in range(rounds):
             state = grid.improve(None, state)
@@ -129,7 +150,7 @@ def _iterate(pencil: Pencil, plan: FilterPlan, max_rounds: int, report: Report) 
         coarse, grid, rounds = grid, grids.pop(), _COARSE_ROUNDS
         state = grid.from_coarse(coarse, state)
     state = _converge(grid, indistinct(pencil, grid.high.dtype), state, max_rounds, report)
-    values, vectors = _wanted(grid, state)
+    values, vectors = _wanted(grid, state, returned)
     del state  # its vectors, while `restrict` makes further ones
     space = pencil.space
     if space.n_dof < vectors.shape[1]:
@@ -138,17 +159,16 @@ def _iterate(pencil: Pencil, plan: FilterPlan, max_rounds: int, report: Report) 
 
 
 # Outside `jit`, each operation on its own would copy all vectors.
-@jax.jit
-def _wanted(grid: GridFilter, state: FilterState) -> Pairs:
-    """Return the wanted pairs on all nodes of the grid."""
-    slabs, k = grid.slabs, grid.plan.wanted
-    vectors = state.vectors[:k]
+@partial(jax.jit, static_argnums=2)
+def _wanted(grid: GridFilter, state: FilterState, returned: int) -> Pairs:
+    """Return the wanted eigenvalues, and the returned vectors on all nodes of the grid."""
+    slabs, vectors = grid.slabs, state.vectors[:returned]
     if slabs is not None:
-        vectors = slabs.join(vectors.reshape(k, *slabs.padded_shape), axis=1).reshape(k, -1)
-    return state.values[:k], vectors
+        vectors = slabs.join(vectors.reshape(returned, *slabs.padded_shape), axis=1).reshape(returned, -1)
+    return state.values[: grid.plan.wanted], vectors
 
 
-_compiled = jax.jit(_iterate, static_argnames=("plan", "max_rounds", "report"))
+_compiled = jax.jit(_iterate, static_argnames=("plan", "max_rounds", "report", "returned"))
 
 
 def _converge(grid: GridFilter, rounding: Array, state: FilterState, max_rounds: int, report: Report) -> FilterState:

@@ -116,6 +116,17 @@ class GridFilter(eqx.Module):
         return subspace.shared(self.slabs, run, EVERYWHERE, _layout(self.slabs))(self, low)
 
     @jax.jit
+    def from_rows(self, rows: Float[Array, "m nodes"]) -> FilterState:
+        """Return the state in the span of functions on the whole grid."""
+        plan, layout = self.plan, _layout(self.slabs)
+
+        def run(grid: GridFilter, rows: Float[Array, "m nodes"]) -> FilterState:
+            numbers = subspace.own_blocks(grid.slabs, plan.size // plan.block)
+            return grid._begin(rows.reshape(-1, plan.block, rows.shape[1])[numbers].reshape(-1, rows.shape[1]))
+
+        return subspace.shared(self.slabs, run, (EVERYWHERE, EVERYWHERE), layout)(self, rows)
+
+    @jax.jit
     def from_coarse(self, coarse: "GridFilter", state: FilterState) -> FilterState:
         """Return the state interpolated from the next coarser grid."""
         slabs, shape, block = coarse.slabs, coarse.pencil.shape, self.plan.block

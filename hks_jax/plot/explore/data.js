@@ -2,29 +2,42 @@
 const element = (id) => document.getElementById(id);
 const about = JSON.parse(element("about").textContent);
 
-function bytes(id) {
+async function bytes(id) {
   const block = element(id);
   const text = atob(block.textContent);
-  const found = new Uint8Array(text.length);
-  for (let i = 0; i < text.length; i++) found[i] = text.charCodeAt(i);
+  const packed = new Uint8Array(text.length);
+  for (let i = 0; i < text.length; i++) packed[i] = text.charCodeAt(i);
   block.remove(); // the text needs more memory than the numbers
-  return found;
+  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
+  return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-const floats = (id) => new Float32Array(bytes(id).buffer);
-const integers = (id) => new Int32Array(bytes(id).buffer);
+// Numbers of 24 bits, the upper bits of single precision, as differences: all first bytes, all second ones, all third.
+async function floats(id) {
+  const planes = await bytes(id);
+  const n = planes.length / 3;
+  const words = new Uint32Array(n);
+  for (let i = 0, last = 0; i < n; i++) {
+    last += planes[i] | (planes[n + i] << 8) | (planes[2 * n + i] << 16);
+    words[i] = last << 8; // which drops the bits of `last` beyond 24
+    last &= 0xffffff;
+  }
+  return new Float32Array(words.buffer);
+}
+
+const integers = async (id) => new Int32Array((await bytes(id)).buffer);
 
 const shape = [...about.shape, 1, 1].slice(0, 3);
 const dimension = about.dimension;
 const times = about.times;
-const inside = bytes("inside");
-const values = floats("values"); // for each time, at the inside nodes in the order of the grid
-const deviations = about.noise ? floats("deviation") : null; // the standard deviations of the values due to noise
-const scores = about.fades ? floats("z") : null; // distances from the values of constant tensors, as normal numbers
-const near = about.rim === null ? null : bytes("near"); // whether the boundary contributes over a tenth
-const anatomy = about.anatomy ? bytes("anatomy") : null; // levels of grey at all nodes of the grid; 0 where there is none
-const layers = about.layers.map((layer, i) => ({ ...layer, values: floats(`layer-${i}`) }));
-const labels = about.labels.length ? integers("labels") : null;
+const inside = await bytes("inside");
+const values = await floats("values"); // for each time, at the inside nodes in the order of the grid
+const deviations = about.noise ? await floats("deviation") : null; // the standard deviations of the values due to noise
+const scores = about.fades ? await floats("z") : null; // distances from the values of constant tensors, as normal numbers
+const near = about.rim === null ? null : await bytes("near"); // whether the boundary contributes over a tenth
+const anatomy = about.anatomy ? await bytes("anatomy") : null; // levels of grey at all nodes of the grid; 0 where there is none
+const layers = await Promise.all(about.layers.map(async (layer, i) => ({ ...layer, values: await floats(`layer-${i}`) })));
+const labels = about.labels.length ? await integers("labels") : null;
 
 // Maps between positions in the grid, flat = (i·ny + j)·nz + k, and the numbers of inside nodes.
 const nodeOfPlace = new Int32Array(inside.length).fill(-1);

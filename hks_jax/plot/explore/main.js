@@ -240,9 +240,12 @@ function showPoints() {
   element("status").textContent = `Point ${state.active} at ${NODE} ${voxel(active).join(", ")}: ${state.quantity.name} ${number(signatureAt(nodeAt(active)))}, distance ${number(apart[nodeAt(active)], farApart)}`;
 }
 
+// The share of the nodes that feel the boundary at each time.
+const shares = times.map((_, t) => (near ? near.subarray(t * count, (t + 1) * count).reduce((sum, one) => sum + one, 0) / count : 0));
+
 function showControls() {
   const { axis, index } = planeOf();
-  const felt = near ? nodesWhere((n) => near[state.time * count + n] === 1).length / count : 0;
+  const felt = shares[state.time];
   element("time-text").textContent = `t = ${timeText(state.time)}${spreadText(state.time)}`;
   element("rim-text").textContent = `hatch the boundary (${Math.round(100 * felt)} %)`;
   element("fade-text").textContent = `|z| = ${element("fade").value}`;
@@ -289,5 +292,6 @@ if (isFlat && typical() > 2) state.quantity = relative;
 setUp();
 measure();
 renderNow();
+document.querySelector("main").removeAttribute("aria-busy");
 new ResizeObserver(render).observe(document.body);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", render);

@@ -1,7 +1,7 @@
 // An orthographic image of a surface on a canvas, turned by dragging. A pixel has the colour of the three vertices of its face.
 const view = { turn: 30, tilt: 20 }; // the angle about the vertical axis z and the elevation, in degrees
 
-const surface = about.mesh ? { vertices: floats("vertices"), faces: integers("faces"), numbers: integers("numbers") } : null;
+const surface = about.mesh ? { vertices: await floats("vertices"), faces: await integers("faces"), numbers: await integers("numbers") } : null;
 
 if (surface) {
   const { vertices } = surface;

@@ -1,9 +1,10 @@
-"""The construction of the page from a signature, with its numbers in base64."""
+"""The construction of the page from a signature, with its numbers compressed and in base64."""
 
 import base64
 import html
 import json
 import os
+import zlib
 from collections.abc import Mapping
 from dataclasses import replace
 from importlib.resources import files
@@ -36,7 +37,7 @@ COLOURS = {"sequential": "viridis", "diverging": "RdBu_r", "distance": "inferno_
 AROUND = 6
 """The number of nodes around the domain at which the anatomical image is shown."""
 LIMIT = 256 * 1024**2
-"""The maximum bytes of numbers in a page. Base64 makes numbers a third longer, and browsers limit texts to 512 MiB."""
+"""The maximum bytes of numbers in a page, which the browser keeps in single precision."""
 
 
 def explore(
@@ -59,7 +60,8 @@ def explore(
     of their difference, divided by the domain's mean at each t. Two points can be compared. A lasso, a maximum distance
     or a label defines a region, whose mean curve and spread are drawn. Curves can be saved as CSV.
 
-    The file contains the numbers in single precision, with 5⅓ bytes for each inside node at each time and in each map.
+    The file contains the numbers rounded to 24 bits, with a relative error of 1.6e-5, and compressed, in 1 to 4 bytes
+    for each inside node at each time and in each map.
 
     Args:
         result: the signature at increasing times. Nodes without finite values at all times are omitted; on a surface,
@@ -115,8 +117,8 @@ def explore(
         if not inside[used].all():
             raise ValueError("values: got NaN or infinite values on a surface; expected finite values")
         inside, renumbered = used, np.cumsum(used) - 1
-        surface = {"faces": _base64(renumbered[mesh.faces], "<i4"), "numbers": _base64(np.flatnonzero(used), "<i4")}
-        surface["vertices"] = _base64(np.asarray(mesh.vertices)[used], "<f4")
+        surface = {"faces": _packed(renumbered[mesh.faces], "<i4"), "numbers": _packed(np.flatnonzero(used), "<i4")}
+        surface["vertices"] = _floats(np.asarray(mesh.vertices)[used])
     else:
         inside &= result.volume.inside
         place = {"spacing": result.volume.spacing, "origin": result.volume.origin}
@@ -147,11 +149,11 @@ def explore(
         shown["near"] = near[:, inside]
     box = bounding_box(inside, margin=0 if grey is None else AROUND)
     shown_inside = inside[inside] if surface else inside[box]
-    numbers = {"inside": _base64(shown_inside, "u1")}
+    numbers = {"inside": _packed(shown_inside, "u1")}
     if grey is not None:
-        numbers["anatomy"] = _base64(grey[box], "u1")
-    numbers |= {name: _base64(array, "u1" if name == "near" else "<f4") for name, array in shown.items()}
-    numbers |= {f"layer-{i}": _base64(array, "<f4") for i, array in enumerate(layers.values())}
+        numbers["anatomy"] = _packed(grey[box], "u1")
+    numbers |= {name: _packed(array, "u1") if name == "near" else _floats(array) for name, array in shown.items()}
+    numbers |= {f"layer-{i}": _floats(array) for i, array in enumerate(layers.values())}
     names: dict[int, str] = {}
     if labels is not None:
         numbers["labels"], names = _regions(labels, label_names, inside)
@@ -256,7 +258,7 @@ def _regions(
         raise ValueError(f"labels: got {found.labels[np.abs(found.labels).argmax()]}; expected numbers below 2^31")
     present = found.labels[found.nodes > 0].tolist()
     known = {label: f"label {label}" for label in present} | dict(names or {})
-    return _base64(np.asarray(labels)[inside], "<i4"), {label: known[label] for label in present}
+    return _packed(np.asarray(labels)[inside], "<i4"), {label: known[label] for label in present}
 
 
 class _Axes(NamedTuple):
@@ -316,11 +318,26 @@ def _assemble(about: dict[str, Any], numbers: dict[str, str]) -> str:
         "TITLE": html.escape(about["title"]),
         "STYLE": (own / "style.css").read_text(encoding="utf-8"),
         "NUMBERS": "\n".join(blocks),
-        "SCRIPT": f'(() => {{\n"use strict";\n{scripts}}})();',
+        "SCRIPT": f'(async () => {{\n"use strict";\n{scripts}}})().catch(tell);',
     }
     pieces = (own / "page.html").read_text(encoding="utf-8").split("@@")
     # Inserted texts are not scanned again, because a title may contain any of the placeholders.
     return "".join(filled[piece] if i % 2 else piece for i, piece in enumerate(pieces))
+
+
+# Rounding to 24 bits leaves a relative error of 2⁻¹⁶, and differences of neighbouring nodes are small numbers. Their
+# first bytes, second bytes and third bytes stand together, so that compression finds the upper bytes nearly constant.
+def _floats(array: ArrayLike) -> str:
+    """Return numbers in the upper 24 bits of single precision, compressed."""
+    words = np.ascontiguousarray(array, "<f4").ravel().view("<u4")
+    upper = (words >> 8) + ((words >> 7) & 1)
+    steps = np.diff(upper, prepend=np.uint32(0)).astype("<u4")
+    return _packed(steps.view("u1").reshape(-1, 4)[:, :3].T, "u1")
+
+
+def _packed(array: ArrayLike, dtype: str) -> str:
+    """Return numbers, compressed."""
+    return _base64(np.frombuffer(zlib.compress(np.asarray(array).astype(dtype).tobytes(), 5), "u1"), "u1")
 
 
 def _base64(array: ArrayLike, dtype: str) -> str:
