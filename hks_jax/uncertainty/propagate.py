@@ -109,9 +109,9 @@ def uncertainty(
     Samples δ of the noise are drawn in groups of four that add up to zero, and the function is evaluated at D + δ/2,
     where D are the measured tensors. The differences of the four values of a group give three samples of the error of
     the value at D, and the mean of the four values gives the bias. Half of δ is added, because D already contains
-    noise: the whole sample δ would exaggerate second-order effects. In no direction is the
-    diffusivity of a noisy tensor below half of the measured one: where the noise is so large, the noisy tensor is
-    raised (`Uncertainty.raised`). The relative error of a standard deviation is 29 %
+    noise: the whole sample δ would exaggerate second-order effects. In no direction is the diffusivity of a noisy
+    tensor below half of the measured one: where the noise is so large, the noisy tensor is raised
+    (`Uncertainty.raised`), and the standard deviation is too small. The relative error of a standard deviation is 29 %
     with 8 draws, and 8 % with 100 draws.
 
     The function is also evaluated at constant tensors, the mean of the measured tensors over the nodes inside the

@@ -220,13 +220,20 @@ class Uncertainty(eqx.Module):
                 f"intervals are not reliable, because noise makes {share:.2%} of the tensors indefinite. Smooth the "
                 "tensors (smoothing=), or leave the noisiest nodes out of the mask"
             ]
+        found = []
+        if (share := float(self.raised)) > 0:
+            found.append(
+                f"deviations are too small at and beside {share:.2%} of the nodes, where noise is as large as the "
+                "diffusivity. Leave the noisiest nodes out of the mask"
+            )
         claimed = np.concatenate([np.asarray(each).ravel() for each in jax.tree.leaves(self.trusted)])
         if claimed.all():
-            return []
+            return found
         return [
+            *found,
             f"intervals are not reliable for {int((~claimed).sum())} of {claimed.size} numbers or maps: the effect of "
             "noise is not linear, or the bias exceeds the deviation (see `trusted`). Only a part of the bias is "
-            "corrected there. Smooth the tensors (smoothing=)"
+            "corrected there. Smooth the tensors (smoothing=)",
         ]
 
     def summary(self) -> str:
@@ -238,8 +245,6 @@ class Uncertainty(eqx.Module):
         }[self.method]
         sure = f", with a relative error of {self.sampling_error:.0%}" if self.sampling_error else ""
         lines = [f"{how}{sure}; {self.draws} noisy maps"]
-        if self.raised > 0:
-            lines.append(f"tensors raised to half of the measured diffusivity: {float(self.raised):.2%} of each map")
         size = jax.tree.map(jnp.divide, self.bias, self.deviation)
         part = jax.tree.map(jnp.divide, self._correction, self.bias)
         for name, each in (
