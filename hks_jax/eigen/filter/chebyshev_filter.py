@@ -29,7 +29,7 @@ from hks_jax.fem.stencil import StencilOperator
 from hks_jax.linear.loops import while_loop
 from hks_jax.traced import is_traced
 
-_FIRST_ROUNDS, _COARSE_ROUNDS = 4, 2
+_FIRST_ROUNDS, _COARSE_ROUNDS = 3, 1
 """The numbers of rounds on the coarsest grid, which starts from random functions, and on each intermediate grid."""
 _ROOM = 12
 """The least number of degrees of freedom per vector on a coarse grid."""
@@ -120,16 +120,16 @@ class ChebyshevFilter(Eigensolver[Pencil]):
 
 def _iterate(pencil: Pencil, plan: FilterPlan, max_rounds: int, report: Report) -> Pairs:
     grids = [_replicated(plan.mesh, GridFilter(nodal, upper_end(nodal), plan)) for nodal in _nested(pencil, plan)]
-    grid = grids.pop()
+    rounding, grid = indistinct(pencil, grids[0].high.dtype), grids.pop()
     state, rounds = grid.from_random(pencil.volume), _FIRST_ROUNDS
     while grids:
         for _ in range(rounds):
-            state = grid.improve(None, state)
+            state = grid.improve(rounding, state)
         if not is_traced(state):
             report(f"grid {' × '.join(map(str, grid.pencil.shape))}")
         coarse, grid, rounds = grid, grids.pop(), _COARSE_ROUNDS
         state = grid.from_coarse(coarse, state)
-    state = _converge(grid, indistinct(pencil, grid.high.dtype), state, max_rounds, report)
+    state = _converge(grid, rounding, state, max_rounds, report)
     slabs, vectors = grid.slabs, state.vectors[: plan.wanted]
     vectors = vectors.reshape(plan.wanted, *(grid.pencil.shape if slabs is None else slabs.padded_shape))
     vectors = vectors if slabs is None else slabs.join(vectors, axis=1)
