@@ -31,9 +31,10 @@ _SPREAD = 1e5
 dominates."""
 _LEAST_DEGREE = 4
 _PASSES = 2
-"""The number of filters in each round, between two Rayleigh–Ritz projections."""
-_SPARE_TOLERANCE = 0.3
-"""The relative residual at which a vector beyond the wanted ones is accurate enough."""
+"""The number of filters between two Rayleigh–Ritz projections. With more, low modes would dominate the vectors."""
+_SPARE_TOLERANCE = 0.03
+"""The relative residual at which a vector beyond the wanted ones is accurate enough. The errors of these vectors enter
+the convergence of the wanted ones as squares."""
 _MARGIN = 1.1
 """The safety factor of Weyl's law for the eigenvalue of the last vector."""
 _SPLIT, _APART = 0.02, 1.5
