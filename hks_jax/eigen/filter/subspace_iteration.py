@@ -32,7 +32,7 @@ dominates."""
 _LEAST_DEGREE = 4
 _PASSES = 2
 """The number of filters between two Rayleigh–Ritz projections. With more, low modes would dominate the vectors."""
-_SPARE_TOLERANCE = 0.03
+_SPARE_TOLERANCE = 0.1
 """The relative residual at which a vector beyond the wanted ones is accurate enough. The errors of these vectors enter
 the convergence of the wanted ones as squares."""
 _MARGIN = 1.1
