@@ -13,6 +13,7 @@ import hks_jax as hj
 from hks_jax.eigen.filter import chebyshev_filter
 from hks_jax.eigen.filter.coarsening import coarsen, interpolate
 from hks_jax.eigen.filter.polynomial import MOST_DEGREE, Band, correction, upper_end
+from hks_jax.eigen.filter.subspace_iteration import GridFilter
 from hks_jax.fem.box import cropped
 from hks_jax.fem.nodal import nodal_pencil, to_columns, to_rows
 
@@ -186,6 +187,21 @@ def test_pairs_equal_the_dense_ones(name):
     gram = pairs.vectors @ pencil.mass.apply(pairs.vectors).T
     np.testing.assert_allclose(gram, np.eye(k), atol=1e-10)
     assert any("of 25 pairs" in text for text in rounds)
+    assert sum("of 25 pairs" in text for text in rounds) <= (5 if name == "2d" else 7)
+
+
+def test_a_filter_changes_only_blocks_with_a_vector_that_is_not_accurate():
+    pencil = problem("2d")
+    nodal = nodal_pencil(pencil)
+    grid = GridFilter(nodal, upper_end(nodal), hj.ChebyshevFilter(block=8).plan(8, pencil.space))
+    state = grid.from_random(pencil.volume)
+    chosen = grid.choose(jnp.zeros(()), state)
+    for allowed, changed in ((0.9, False), (1.1, True)):
+        # Only the last vector of the first block is less accurate than the others are allowed to be.
+        limits = jnp.full(16, jnp.inf).at[7].set(state.residuals[7] / allowed)
+        found = grid.filter_block(chosen._replace(allowed=limits), *jnp.zeros(2, int), jnp.copy(state.vectors))
+        assert np.any(found[:8] != state.vectors[:8]) == changed
+        np.testing.assert_array_equal(found[8:], state.vectors[8:])
 
 
 @pytest.mark.parametrize("boundary", ["mean", pytest.param("dirichlet", marks=pytest.mark.slow)])

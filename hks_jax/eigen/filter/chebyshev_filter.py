@@ -29,7 +29,7 @@ from hks_jax.fem.stencil import StencilOperator
 from hks_jax.linear.loops import while_loop
 from hks_jax.traced import is_traced
 
-_FIRST_ROUNDS, _COARSE_ROUNDS = 4, 2
+_FIRST_ROUNDS, _COARSE_ROUNDS = 3, 1
 """The numbers of rounds on the coarsest grid, which starts from random functions, and on each intermediate grid."""
 _ROOM = 12
 """The least number of degrees of freedom per vector on a coarse grid."""
@@ -136,7 +136,7 @@ def _iterate(
 ) -> Pairs:
     nested = _nested(pencil, plan) if start is None else [nodal_pencil(pencil)]
     grids = [_replicated(plan.mesh, GridFilter(nodal, upper_end(nodal), plan)) for nodal in nested]
-    grid = grids.pop()
+    rounding, grid = indistinct(pencil, grids[0].high.dtype), grids.pop()
     if start is None:
         state = grid.from_random(pencil.volume)
     else:
@@ -144,12 +144,12 @@ def _iterate(
     rounds = _FIRST_ROUNDS
     while grids:
         for _ in range(rounds):
-            state = grid.improve(None, state)
+            state = grid.improve(rounding, state)
         if not is_traced(state):
             report(f"grid {' × '.join(map(str, grid.pencil.shape))}")
         coarse, grid, rounds = grid, grids.pop(), _COARSE_ROUNDS
         state = grid.from_coarse(coarse, state)
-    state = _converge(grid, indistinct(pencil, grid.high.dtype), state, max_rounds, report)
+    state = _converge(grid, rounding, state, max_rounds, report)
     values, vectors = _wanted(grid, state, returned)
     del state  # its vectors, while `restrict` makes further ones
     space = pencil.space

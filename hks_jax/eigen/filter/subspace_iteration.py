@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.arrays import Scalar
 from hks_jax.eigen.filter import subspace
@@ -18,7 +19,7 @@ from hks_jax.eigen.filter.subspace import EVERYWHERE
 from hks_jax.eigen.quality import allowed_residuals
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.halo import Slabs
-from hks_jax.fem.nodal import NodalPencil, to_columns, to_rows
+from hks_jax.fem.nodal import NodalPencil, to_rows
 from hks_jax.linear.accelerators import row_by_row
 from hks_jax.linear.loops import for_each
 from hks_jax.linear.products import aligned
@@ -29,6 +30,11 @@ _SPREAD = 1e5
 """The largest value at 0 of a filter polynomial that is at most 1 on the band; with a larger value, rounding
 dominates."""
 _LEAST_DEGREE = 4
+_PASSES = 2
+"""The number of filters between two Rayleigh–Ritz projections. With more, low modes would dominate the vectors."""
+_SPARE_TOLERANCE = 0.1
+"""The relative residual at which a vector beyond the wanted ones is accurate enough. The errors of these vectors enter
+the convergence of the wanted ones as squares."""
 _MARGIN = 1.1
 """The safety factor of Weyl's law for the eigenvalue of the last vector."""
 _SPLIT, _APART = 0.02, 1.5
@@ -71,9 +77,10 @@ class Filtering(NamedTuple):
 
     band: Band  # the damped interval
     terms: Number  # the number of terms, after the first, of the Neumann series
-    degrees: Int[Array, " blocks"]  # the degree of each block's polynomial; 0 if the whole block has converged
+    degrees: Int[Array, " blocks"]  # the degree of each block's polynomial
     values: Values  # the value ψ of each vector, at which its polynomial is 1
     factor: Values  # the factor by which each vector's correction is scaled
+    allowed: Values  # the residual up to which each vector counts as converged; blocks of such vectors are not filtered
 
 
 class GridFilter(eqx.Module):
@@ -91,8 +98,16 @@ class GridFilter(eqx.Module):
     @jax.jit
     def excess(self, rounding: Scalar, state: FilterState) -> Values:
         """Return the residuals as multiples of the largest residuals that count as converged."""
-        scale = jnp.maximum(state.values, state.values[self.plan.n_null])
-        return state.residuals / allowed_residuals(scale, rounding, self.plan.tolerance)
+        return state.residuals / self._allowed(rounding, state.values)
+
+    def _allowed(self, rounding: Scalar, values: Values) -> Values:
+        scale = jnp.maximum(values, values[self.plan.n_null])
+        allowed = allowed_residuals(scale, rounding, self.plan.tolerance)
+        return jnp.where(self._spare, jnp.maximum(allowed, _SPARE_TOLERANCE * scale), allowed)
+
+    @property
+    def _spare(self) -> Bool[np.ndarray, " m"]:
+        return np.arange(self.plan.size) >= self.plan.wanted
 
     @jax.jit
     def from_random(self, volume: Scalar) -> FilterState:
@@ -143,27 +158,30 @@ class GridFilter(eqx.Module):
         return subspace.shared(self.slabs, run, (EVERYWHERE, layout.vectors), layout)(self, state.vectors)
 
     def improve_told(
-        self, rounding: Scalar | None, state: FilterState, done: Callable[[int, int], Any] | None = None
+        self, rounding: Scalar, state: FilterState, done: Callable[[int, int], Any] | None = None
     ) -> FilterState:
-        """Filter the blocks of vectors that have not converged (all if ``rounding`` is None), then apply Rayleigh–Ritz.
+        """Filter the blocks of vectors that have not converged, `_PASSES` times, then apply Rayleigh–Ritz.
 
         Outside `jit` and on one device, the round can be interrupted between two blocks. After each block, ``done``
         receives the numbers of products with K in this round, so far and in total. `improve` is the compiled version.
         """
         slabs, plan, layout = self.slabs, self.plan, _layout(self.slabs)
 
-        def run(grid: GridFilter, rounding: Scalar | None, state: FilterState) -> FilterState:
+        def run(grid: GridFilter, rounding: Scalar, state: FilterState) -> FilterState:
             numbers = subspace.own_blocks(slabs, plan.size // plan.block)
             chosen = grid.choose(rounding, state)
 
-            def step(own: Array, rows: OwnRows) -> OwnRows:
-                rows = grid.filter_block(chosen, state.values, numbers[own], own, rows)
-                if done is not None and chosen.degrees[own]:
+            def step(turn: Array, rows: OwnRows) -> OwnRows:
+                own = turn % numbers.size
+                rows = grid.filter_block(chosen, numbers[own], own, rows)
+                if done is not None:
                     jax.block_until_ready(rows)
-                    done(int(chosen.degrees[: own + 1].sum()), int(chosen.degrees.sum()))
+                    products = jnp.tile(chosen.degrees, _PASSES)
+                    done(int(products[: turn + 1].sum()), int(products.sum()))
                 return rows
 
-            filtered = for_each(numbers.size, step, subspace.to_own_rows(slabs, plan.block, state.vectors))
+            own_rows = subspace.to_own_rows(slabs, plan.block, state.vectors)
+            filtered = for_each(_PASSES * numbers.size, step, own_rows)
             return grid.ritz(subspace.to_slabs(slabs, plan.block, filtered), chosen.terms, state.rounds + 1)
 
         return subspace.shared(slabs, run, (EVERYWHERE, EVERYWHERE, layout), layout)(self, rounding, state)
@@ -171,47 +189,50 @@ class GridFilter(eqx.Module):
     improve = jax.jit(improve_told, donate_argnames="state")
 
     @jax.jit
-    def choose(self, rounding: Scalar | None, state: FilterState) -> Filtering:
+    def choose(self, rounding: Scalar, state: FilterState) -> Filtering:
         """Return the polynomials of a round: the band that they damp, the degree for each block, and further data."""
         plan = self.plan
-        spare = jnp.arange(plan.size) >= plan.wanted
         terms, filtered_values, factor = _lumping(plan, state)
         high = (1 + terms).astype(self.high.dtype) * self.high
         # Weyl's law limits the lower end of the band, because the vectors that are not wanted may be inaccurate.
         edge = _MARGIN * filtered_values[plan.wanted - 1] * (plan.size / plan.wanted) ** (2 / len(self.pencil.shape))
         low = jnp.minimum(jnp.minimum(jnp.max(filtered_values), edge), high / 2)
         band = Band(low, high)
-        left = spare | (True if rounding is None else ~(self.excess(rounding, state) <= 1))
         # For vectors beyond the wanted ones, the degree of the last wanted vector suffices.
-        goal = jnp.where(spare, filtered_values[plan.wanted - 1], filtered_values)
+        goal = jnp.where(self._spare, filtered_values[plan.wanted - 1], filtered_values)
         most = band.degree_for(jnp.zeros_like(low), _SPREAD)
         degrees = jnp.ceil(jnp.clip(band.degree_for(goal, _GAIN), _LEAST_DEGREE, jnp.maximum(most, _LEAST_DEGREE)))
-        degrees = jnp.max(jnp.where(left, degrees, 0).reshape(-1, plan.block), axis=1).astype(int)
-        return Filtering(band, terms, degrees, filtered_values, factor)
+        degrees = jnp.max(degrees.reshape(-1, plan.block), axis=1).astype(int)
+        return Filtering(band, terms, degrees, filtered_values, factor, self._allowed(rounding, state.values))
 
     @partial(jax.jit, donate_argnames="vectors")
-    def filter_block(self, chosen: Filtering, values: Values, number: Number, own: Number, vectors: OwnRows) -> OwnRows:
+    def filter_block(self, chosen: Filtering, number: Number, own: Number, vectors: OwnRows) -> OwnRows:
         """Filter the block of vectors with index ``number`` among all blocks and ``own`` among this device's blocks."""
-        pencil, block, products = self.pencil, self.plan.block, self.pencil.products()
-        band, degree = chosen.band, chosen.degrees[number]
+        pencil, block = self.pencil, self.plan.block
+        x = subspace.block_of(vectors, own, block, pencil.shape)
+        zeta, scale, allowed = (
+            jax.lax.dynamic_slice_in_dim(of_all, number * block, block)
+            for of_all in (chosen.values, chosen.factor, chosen.allowed)
+        )
 
-        def filtered(rows: Float[Array, "b nodes"]) -> Float[Array, "b nodes"]:
-            x = to_columns(rows, pencil.shape)
-            theta, zeta, scale = (
-                jax.lax.dynamic_slice_in_dim(v, number * block, block) for v in (values, chosen.values, chosen.factor)
-            )
+        def total(terms: Float[Array, "*shape b"]) -> Float[Array, " b"]:
+            return jnp.sum(terms, tuple(range(terms.ndim - 1)))
+
+        image, moved = pencil.products()(x)
+        residual = image - aligned(total(x * image) / total(x * moved), x) * moved
+        left = ~(total(residual**2) <= allowed**2 * total(moved**2))
+
+        def filtered(image: Float[Array, "*shape b"], residual: Float[Array, "*shape b"]) -> Float[Array, "*shape b"]:
             # If the quotient ζ of x is in the damped band, the residual is large, and the polynomial is applied to x.
-            inside = aligned(zeta > band.low, x)
-            image, moved = products(x)
-            residual = image - jnp.where(inside, 0, aligned(theta, x) * moved)
+            inside = aligned(zeta > chosen.band.low, x)
+            of_residual = jnp.where(inside, image, residual).astype(jnp.float32)
             whole = jnp.where(inside, x, 0).astype(jnp.float32)
-            z = correction(pencil, band, residual.astype(jnp.float32), zeta, degree, whole, chosen.terms)
-            z = jnp.where(inside, 1, aligned(jnp.clip(scale, 0, 1), x)) * z.astype(x.dtype)
-            return rows + row_by_row(to_rows(z))
+            degree = chosen.degrees[number]
+            z = correction(pencil, chosen.band, of_residual, zeta, degree, whole, chosen.terms)
+            return jnp.where(inside, 1, aligned(jnp.clip(scale, 0, 1), x)) * z.astype(x.dtype)
 
-        # `cond` gets only the block, because XLA copies the operands of a condition.
-        rows = row_by_row(jax.lax.dynamic_slice_in_dim(vectors, own * block, block))
-        rows = jax.lax.cond(degree > 0, filtered, lambda unchanged: unchanged, rows)
+        z = jax.lax.cond(jnp.any(left), filtered, lambda *_: jnp.zeros_like(x), image, residual)
+        rows = row_by_row(jax.lax.dynamic_slice_in_dim(vectors, own * block, block)) + row_by_row(to_rows(z))
         return jax.lax.dynamic_update_slice_in_dim(vectors, rows, own * block, axis=0)
 
     @partial(jax.jit, donate_argnames="vectors")
