@@ -93,7 +93,8 @@ def stages(n: int, k: int) -> Iterator[Stage]:
     yield "coarser grid", coarsen, (nodal,), own[:3]
     yield "start", GridFilter.from_coarse, (fine, next_to, state_of(plan, coarse.free.size)), (own[:3], coarse)
     yield "round", GridFilter.improve, (fine, one, state), (own[:3], coarse)
-    yield "wanted pairs", _wanted, (fine, state), (own, matrices, coarse)
+    wanted = partial(_wanted, returned=k + 1)
+    yield "wanted pairs", wanted, (fine, state), (own, matrices, coarse)
     of_nulls = pencil.mass, array(1, nodes), array(k + 1), vectors
     yield "null vectors", traced(_with_null_modes), of_nulls, (own, pencil.stiffness)
     yield "first k", lambda values, vectors: traced(_cut)(values, vectors, k), (array(k + 1), vectors), (own, matrices)

@@ -150,7 +150,7 @@ def _iterate(
         coarse, grid, rounds = grid, grids.pop(), _COARSE_ROUNDS
         state = grid.from_coarse(coarse, state)
     state = _converge(grid, rounding, state, max_rounds, report)
-    values, vectors = _wanted(grid, state, returned)
+    values, vectors = _wanted(grid, state, returned=returned)
     del state  # its vectors, while `restrict` makes further ones
     space = pencil.space
     if space.n_dof < vectors.shape[1]:
@@ -159,7 +159,7 @@ def _iterate(
 
 
 # Outside `jit`, each operation on its own would copy all vectors.
-@partial(jax.jit, static_argnums=2)
+@partial(jax.jit, static_argnames="returned")
 def _wanted(grid: GridFilter, state: FilterState, returned: int) -> Pairs:
     """Return the wanted eigenvalues, and the returned vectors on all nodes of the grid."""
     slabs, vectors = grid.slabs, state.vectors[:returned]
