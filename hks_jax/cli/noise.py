@@ -27,6 +27,9 @@ _SIGNAL = 1.0
 """The signal-to-noise ratio at which automatic times begin."""
 _LEAST = 0.1
 """The least share of nodes in the interior; fewer nodes do not represent the variation of a map."""
+_FLOOR = 0.5
+"""The least diffusivity of noisy tensors of volumes, as a fraction of the measured one. With less, an eigenproblem
+takes several times as long."""
 _CLEAR = 2.0
 """The report contains the first time with a signal-to-noise ratio above this value."""
 
@@ -165,6 +168,7 @@ def _error_bars(
         in_volume = domain.volume is not None and domain.volume is not domain.place  # JAX cannot trace the sampling
         # The filter compiles its rounds itself, and outside `jit` it solves for fewer pairs of each problem.
         more: dict[str, Any] = {"draws": noise.draws, "compiled": not (in_volume or starts), "checkpoint": checkpoint}
+        more |= {"floor": _FLOOR} if pairs.space.dimension == 3 else {}
         more |= {"each": lambda one: maps.append(np.asarray(one, np.float32)), "progress": progress.update}
         bars = hj.uncertainty(signature, tensors, noise.of_tensors, method="resample", **more)
         interior = np.isfinite(np.asarray(bars.value))

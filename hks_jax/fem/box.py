@@ -87,20 +87,22 @@ def _in_its_box(space: FunctionSpace) -> GridSpace:
     return space.around[1]
 
 
-# The eigenvalue of the separate equations is the largest quotient Kᵢᵢ/Mᵢᵢ of the free nodes, a Rayleigh quotient, and
-# so at most the largest eigenvalue of the pencil. The quotient Kᵢᵢ/Mᵢᵢ must exceed the lowest quarter of the spectrum.
-# With a consistent mass and node spacing h, Kᵢᵢ/Mᵢᵢ is 6/h² in 2D and 9/h² in 3D, and the lowest quarter of the
-# spectrum ends at 3.8/h² and 7.6/h². With a lumped mass, Kᵢᵢ/Mᵢᵢ is 2.7/h², and the lowest quarter of the spectrum ends
-# at 2.2/h² in 2D and 2.4/h² in 3D. Because 2.7/h² is so close to the lowest quarter, the quotient of a lumped mass is
-# doubled; the spectrum in 2D then ends at 5.3/h², not at 4/h².
+# The eigenvalue of the separate equations must exceed the lowest quarter of the spectrum, and should not exceed the
+# largest eigenvalue by much. With a consistent mass it is the largest quotient Kᵢᵢ/Mᵢᵢ of the free nodes, a Rayleigh
+# quotient. For the Laplacian and the node spacing h, this is 6/h² in 2D and 9/h² in 3D, and the lowest quarter of the
+# spectrum ends at 3.8/h² and 7.6/h². With a lumped mass, Kᵢᵢ/Mᵢᵢ is 2.7/h², which is too close to the lowest quarter:
+# that ends at 2.2/h² in 2D and 2.4/h² in 3D. So Gershgorin's upper bound of the spectrum is used. Both move with the
+# spectrum if a potential is constant.
 @jax.jit
 def _with_others(
     stiffness: Float[Array, "offsets *shape"], mass: Float[Array, "m *shape"], free: Bool[np.ndarray | Array, "*shape"]
 ) -> tuple[Float[Array, "offsets *shape"], Float[Array, "m *shape"]]:
     of_stiffness, of_mass = len(stiffness) // 2, len(mass) // 2
-    diagonals = jax.lax.stop_gradient((stiffness[of_stiffness], mass[of_mass]))
-    own, unit = (jnp.where(free, diagonal, 0) for diagonal in diagonals)
+    rows, unit = jax.lax.stop_gradient((stiffness, jnp.where(free, mass[of_mass], 0)))
+    own = rows[of_stiffness]
+    if len(mass) == 1:
+        own = own + jnp.sum(jnp.abs(rows), axis=0) - jnp.abs(own)
     size = jnp.sum(unit) / jnp.sum(free).astype(unit.dtype)
-    above = (2.0 if len(mass) == 1 else 1.0) * jnp.max(own / jnp.where(free, unit, 1)) * size
+    above = jnp.max(jnp.where(free, own, -jnp.inf) / jnp.where(free, unit, 1)) * size
     others = jnp.where(free, 0, above), jnp.where(free, 0, size)
     return stiffness.at[of_stiffness].add(others[0]), mass.at[of_mass].add(others[1])

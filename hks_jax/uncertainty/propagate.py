@@ -38,8 +38,6 @@ LEAST = 8
 """The least number of noisy tensor fields for estimates of the bias and of the variance's second-order part."""
 _SCALE = 0.5
 """The factor s of samples of the noise. It is less than 1, because the measured tensors already contain noise."""
-FLOOR = 0.5
-"""The least diffusivity of a noisy tensor in any direction, as a fraction of the measured diffusivity."""
 _LOUD = 3.0
 """The upper limit for the noise: the standard deviation relative to the mean diffusivity, in the median over nodes."""
 
@@ -96,6 +94,7 @@ def uncertainty(
     progress: Callable[[str], None] | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
     each: Callable[[Any], None] | None = None,
+    floor: float = 0.01,
 ) -> Uncertainty:
     """Compute the standard deviation and the bias of a function of measured tensors due to their noise.
 
@@ -109,10 +108,8 @@ def uncertainty(
     Samples δ of the noise are drawn in groups of four that add up to zero, and the function is evaluated at D + δ/2,
     where D are the measured tensors. The differences of the four values of a group give three samples of the error of
     the value at D, and the mean of the four values gives the bias. Half of δ is added, because D already contains
-    noise: the whole sample δ would exaggerate second-order effects. In no direction is the diffusivity of a noisy
-    tensor below half of the measured one: where the noise is so large, the noisy tensor is raised
-    (`Uncertainty.raised`), and the standard deviation is too small. The relative error of a standard deviation is 29 %
-    with 8 draws, and 8 % with 100 draws.
+    noise: the whole sample δ would exaggerate second-order effects. The relative error of a standard deviation is
+    29 % with 8 draws, and 8 % with 100 draws.
 
     The function is also evaluated at constant tensors, the mean of the measured tensors over the nodes inside the
     noise's grid at which maps of the result are finite. The constant tensors are the null hypothesis of
@@ -140,6 +137,9 @@ def uncertainty(
         each: a function that is called with each sample of the value's error (three for every four noisy tensor
             fields), for example to compute covariances. With a checkpoint, the file contains these samples, and the
             function is called again for them when resampling continues.
+        floor: the least diffusivity of a noisy tensor in any direction, as a fraction of the measured one. Where noise
+            takes more, the tensor is raised (`Uncertainty.raised`), and standard deviations are too small there. A
+            larger number such as 0.5 saves time in volumes, whose eigensolver is slow if tensors are nearly singular.
 
     Returns:
         The value with its standard deviation, its bias and their accuracy. Under `jit`, `method` must not be
@@ -159,7 +159,7 @@ def uncertainty(
         0.25
     """
     measured = real_array("tensors", tensors)
-    _check(measured, noise, method, draws, smoothing)
+    _check(measured, noise, method, draws, smoothing, floor)
 
     def smoothed(D: Array) -> Array:
         return smooth_tensors(noise.grid, D, smoothing) if noise.grid is not None and smoothing else D
@@ -180,7 +180,7 @@ def uncertainty(
         size = sum(leaf.size for leaf in jax.tree.leaves(value))
         method = "exact" if compiled and size <= draws else "resample"
     samples = -(-draws // _BALANCED) if method == "resample" else LEAST // _BALANCED
-    moments = _sampled(run, value, measured, noise, seed, samples, progress, checkpoint, each)
+    moments = _sampled(run, value, measured, noise, seed, samples, progress, checkpoint, each, floor)
     variance = jax.tree.map(lambda odd: odd / samples, moments.odd)
     spread = jax.tree.map(lambda s: s / (samples - 1), moments.spread)
     freedom: float = samples * (_BALANCED - 1)
@@ -215,13 +215,16 @@ def uncertainty(
     return result
 
 
-def _check(measured: Array, noise: TensorNoise, method: str, draws: int, smoothing: float) -> None:
+def _check(measured: Array, noise: TensorNoise, method: str, draws: int, smoothing: float, floor: float) -> None:
     if not isinstance(noise, TensorNoise):
         raise TypeError(f"noise: got {type(noise).__name__}; expected hks_jax.TensorNoise")
     if method not in get_args(Method):
         raise ValueError(f"method: got {method!r}; expected one of {', '.join(get_args(Method))}")
     require_count("draws", draws, LEAST)
     require_number("smoothing", smoothing, inclusive=True)
+    require_number("floor", floor)
+    if floor >= 1:
+        raise ValueError(f"floor: got {floor:g}; expected a fraction below 1")
     if smoothing and noise.grid is None:
         raise ValueError("smoothing: got a length, but the noise has no grid. Pass the tensors' grid to TensorNoise")
     d = noise.dimension
@@ -249,11 +252,10 @@ def _check(measured: Array, noise: TensorNoise, method: str, draws: int, smoothi
 # singular tensor isolates its node from the neighbours, so that a mode of this node appears among the lowest ones, and
 # the eigensolver takes many times as long. With D = LLᵀ, the noisy tensor N is at least cD in any direction if and only
 # if N − cD is positive semidefinite, or all eigenvalues of L⁻¹NL⁻ᵀ are at least c. Smaller ones are raised to c.
-def _floored(measured: Array, noisy: Array) -> tuple[Array, Array]:
-    """Raise the diffusivity of noisy tensors to the fraction `FLOOR` of the measured one; also return the share that
-    this changed."""
+def _floored(measured: Array, noisy: Array, floor: Any) -> tuple[Array, Array]:
+    """Raise the diffusivity of noisy tensors to a fraction of the measured one; also return the share that changed."""
     valid = spd.is_positive(measured)
-    low = valid & ~spd.is_positive(noisy - FLOOR * measured)
+    low = valid & ~spd.is_positive(noisy - floor * measured)
 
     def raised(noisy: Array) -> Array:
         chosen = low[..., None, None]
@@ -261,7 +263,7 @@ def _floored(measured: Array, noisy: Array) -> tuple[Array, Array]:
         half = solve_triangular(root, jnp.where(chosen, noisy, 0), lower=True)
         values, vectors = spd.eigh(solve_triangular(root, jnp.swapaxes(half, -1, -2), lower=True))
         axes = jnp.einsum("...ij,...ja->...ia", root, vectors, precision="highest")
-        higher = jnp.einsum("...ia,...a,...ja->...ij", axes, jnp.maximum(values, FLOOR), axes, precision="highest")
+        higher = jnp.einsum("...ia,...a,...ja->...ij", axes, jnp.maximum(values, floor), axes, precision="highest")
         return jnp.where(chosen, higher, noisy)
 
     return jax.lax.cond(low.any(), raised, lambda noisy: noisy, noisy), _share(low, valid, measured.dtype)
@@ -291,7 +293,7 @@ def _white(noise: TensorNoise, seed: Any, index: Any, dtype: Any) -> Array:
 
 
 @jax.jit
-def _four(measured: Array, noise: TensorNoise, seed: Any, index: Any) -> tuple[list[Array], Array, Array]:
+def _four(measured: Array, noise: TensorNoise, seed: Any, index: Any, floor: Any) -> tuple[list[Array], Array, Array]:
     """Return four noisy fields, the sum of the shares of tensors that the full noise makes indefinite in each, and the
     sum of the shares of tensors that `_floored` changes in each."""
     each = jnp.stack([noise.tensors(_white(noise, seed, 3 * index + i, measured.dtype)) for i in range(3)])
@@ -300,7 +302,7 @@ def _four(measured: Array, noise: TensorNoise, seed: Any, index: Any) -> tuple[l
     )
     valid = spd.is_positive(measured)
     lost = jnp.stack([_share(valid & ~spd.is_positive(measured + change), valid, measured.dtype) for change in changes])
-    noisy, raised = zip(*(_floored(measured, measured + _SCALE * change) for change in changes), strict=True)
+    noisy, raised = zip(*(_floored(measured, measured + _SCALE * change, floor) for change in changes), strict=True)
     return list(noisy), lost.sum(), jnp.stack(raised).sum()
 
 
@@ -314,13 +316,14 @@ def _sampled(
     progress: Callable[[str], None] | None,
     checkpoint: str | os.PathLike[str] | None,
     each: Callable[[Any], None] | None,
+    floor: float,
 ) -> _Moments:
     nothing = jax.tree.map(jnp.zeros_like, value)
     none = jnp.zeros((), measured.dtype)
     moments = _Moments(none, nothing, nothing, nothing, none, none)
 
     def step(index: Any, moments: _Moments, run: Callable[[Array], Any] = run) -> tuple[_Moments, Any]:
-        noisy, lost, raised = _four(measured, noise, seed, index)
+        noisy, lost, raised = _four(measured, noise, seed, index, floor)
         found, even = _parts([run(one) for one in noisy], value)
         return moments.add(found, even, lost, raised), found
 
@@ -336,7 +339,7 @@ def _sampled(
     if checkpoint is not None:
         from hks_jax.inverse.checkpoint import fingerprint  # this import is slow
 
-        mark = fingerprint(value, _four(measured, noise, seed, 0), each is None)
+        mark = fingerprint(value, _four(measured, noise, seed, 0, floor), each is None)
         if Path(checkpoint).exists():
             data = load_npz(checkpoint)
             if str(data.get("mark")) != mark:

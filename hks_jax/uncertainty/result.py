@@ -36,8 +36,8 @@ class Uncertainty(eqx.Module):
         smear: the change of the value if the smoothed tensors are smoothed once more, an estimate of the change that
             smoothing causes; None without smoothing.
         indefinite: the share of the measured tensors that a sample of the noise, added as a whole, makes indefinite.
-        raised: the share of the noisy tensors whose diffusivity in some direction was raised to half of the measured
-            diffusivity, because the noise is too large there.
+        raised: the share of the noisy tensors whose diffusivity in some direction was raised to a fraction of the
+            measured one (see ``floor`` of `uncertainty`), because the noise is too large there.
         sampling_error: the relative standard deviation of ``deviation``; 0 if ``deviation`` is exact to first order.
         method: ``"resample"``, ``"linear"`` or ``"exact"``.
         draws: the number of noisy tensor fields at which the function was evaluated.

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy
 from annotations import unchecked
 from fields import flat, random_spd
 
@@ -264,3 +265,18 @@ def test_equations_of_masked_nodes_are_not_among_the_pairs(rng, boundary, mass):
         pairs = hj.eigenpairs(field, k, boundary, "shift-invert", mass)
         assert pairs.vectors.shape == (k, mask.sum())
         np.testing.assert_allclose(pairs.eigenvalues, exact.eigenvalues[:k], rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize(("mass", "sign"), [("lumped", 1), ("lumped", -1), ("consistent", -1)])
+def test_equations_of_nodes_outside_a_mask_are_above_the_spectrum_s_beginning(mass, sign):
+    """A negative potential or −K moves the spectrum below zero, and the separate equations with it."""
+    n, k = 44, 4
+    grid = hj.Grid((n, n), mask=np.hypot(*(np.indices((n, n)) - (n - 1) / 2)) <= n / 2 - 0.5)
+    pencil = hj.assemble(hj.TensorField(grid, np.tile(np.eye(2), (n, n, 1, 1))), mass=mass, potential=-30.0)
+    if sign < 0:
+        pencil = pencil.with_stiffness(pencil.stiffness.with_flat(-pencil.stiffness.flat()))
+    assert pencil.size < n**2
+    pairs = hj.eigenpairs(pencil, k, solver="shift-invert")
+    dense = pencil.stiffness.to_dense(), pencil.mass.to_dense()
+    np.testing.assert_allclose(pairs.eigenvalues, scipy.linalg.eigh(*dense, subset_by_index=[0, k - 1])[0], rtol=1e-10)
+    assert (jnp.abs(pairs.vectors).max(axis=1) > 0).all()
