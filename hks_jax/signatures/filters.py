@@ -129,7 +129,7 @@ def mixing(
 ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"], Float[Array, "m k k"], Bool[Array, "m k"]]:
     """Return f(λᵢ), the divided differences of f and λf, and marks of pairs that matter, for each filter f.
 
-    Pair i does not matter if f(λᵢ) and λᵢ f'(λᵢ) are negligible relative to the largest such value at λ > 0.
+    Pair i does not matter if λᵢ > 0, and f(λᵢ) and λᵢ f'(λᵢ) are negligible relative to the largest such value.
     """
     rows, columns = values[:, None], values[None]
     low, high, gap = jnp.minimum(rows, columns), jnp.maximum(rows, columns), rows - columns
@@ -145,7 +145,7 @@ def mixing(
         size = jnp.maximum(jnp.abs(f), jnp.abs(values * jnp.diagonal(of_f)))
         # For two negligible pairs i and j, the divided difference is at most f' at one of them if f is monotone, and at
         # most ε divided by the relative gap of λᵢ and λⱼ if f is not. NaN counts as not negligible.
-        negligible = size <= jnp.finfo(f.dtype).eps * jnp.max(jnp.where(values > 0, size, 0))
+        negligible = (values > 0) & (size <= jnp.finfo(f.dtype).eps * jnp.max(jnp.where(values > 0, size, 0)))
         return f, of_f, of_lambda_f, ~negligible
 
     return jax.lax.map(of_one, filters)
