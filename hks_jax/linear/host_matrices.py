@@ -123,5 +123,10 @@ def near_zero(
     return np.sum(columns * (K @ columns), axis=0) / squares, rounding
 
 
+# The assembly computes the entries (i, j) and (j, i) separately, so their rounding errors differ. `host_matrices`
+# corrects the sums of rows; without symmetry, the sums of columns would be wrong, and LAPACK reads only one triangle.
+# In nearly cut domains, small eigenvalues in float32 would be wrong by the rounding error of the largest one.
 def _csc(data: ArrayLike, pattern: Places, n: int) -> csc_matrix:
-    return coo_matrix((np.asarray(data, np.float64), pattern), shape=(n, n)).tocsc()
+    """Return the symmetric part of a matrix."""
+    matrix = coo_matrix((np.asarray(data, np.float64), pattern), shape=(n, n)).tocsc()
+    return (matrix + matrix.T) / 2

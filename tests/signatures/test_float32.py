@@ -176,6 +176,27 @@ def test_eigenvalues_far_below_the_largest_are_accurate():
     np.testing.assert_allclose(pairs.eigenvalues[1], 1e-6, rtol=2e-6)
 
 
+@pytest.mark.parametrize("operator", ["fick", "weighted"])  # NumPy assembles Fick's operator, XLA the weighted one
+def test_small_eigenvalues_of_nearly_cut_domains_are_accurate(operator):
+    mask, bridge = np.ones((24, 24), bool), np.ones((24, 24))
+    mask[11:13, :10] = mask[11:13, 12:] = False
+    bridge[11:13, 10:12] = 1e-5
+
+    def lowest(dtype, solver):
+        flat = jnp.broadcast_to(jnp.eye(2, dtype=dtype), (24, 24, 2, 2))
+        grid, values = hj.Grid((24, 24), 1 / 23, mask=mask), jnp.asarray(bridge, dtype)
+        if operator == "weighted":
+            return hj.eigenpairs(hj.assemble(hj.TensorField(grid, flat), density=values), 2, solver=solver)
+        diffusivity = values[..., None, None] * flat
+        return hj.eigenpairs(hj.TensorField.from_diffusion(grid, diffusivity, operator="fick"), 2, solver=solver)
+
+    exact = lowest(jnp.float64, "dense").eigenvalues
+    for solver in ("dense", "shift-invert"):
+        pairs = lowest(jnp.float32, solver)
+        assert pairs.rounding[1] < 1e-6 * pairs.eigenvalues[1] < 1e-10
+        np.testing.assert_allclose(pairs.eigenvalues, exact, rtol=2e-6)
+
+
 @pytest.mark.parametrize(("n", "solver"), [pytest.param(33, "dense", marks=pytest.mark.slow), (65, "shift-invert")])
 def test_a_small_potential_raises_the_lowest_eigenvalue(n, solver):
     for potential in (0.01, 0.1, 1.0):
