@@ -53,7 +53,8 @@ def gaps(xp: Any, values: Any, k: int, rounding: Any) -> tuple[Any, Any]:
     """Return the mask (k, p) of pairs of distinct eigenvalues, and 1/(λᵢ − λⱼ), which is 0 for equal eigenvalues."""
     gap, above = values[:k, None] - values[None], values - xp.nanmin(values)
     least = xp.sqrt(xp.finfo(values.dtype).eps) * xp.maximum(above[:k, None], above[None])
-    # The bound of rounding errors is a worst case, which may exceed the gaps of the whole spectrum.
+    # The bound of rounding errors is a worst case, which may exceed even the range of all eigenvalues. This limit holds
+    # then too, unlike in `multiplets.gaps_to_next`, because derivatives would lack the terms of distinct eigenvalues.
     rounding = xp.minimum(rounding, xp.nanmax(above[: k + 1]) / 1000)
     apart = xp.abs(gap) > xp.maximum(least, rounding)
     return apart, xp.where(apart, 1 / xp.where(apart, gap, 1), 0)

@@ -18,6 +18,7 @@ from fields import random_spd
 import hks_jax as hj
 from hks_jax.eigen.adjoints.complement import attainable
 from hks_jax.eigen.adjoints.factorised_adjoint import FactorisedAdjoint
+from hks_jax.eigen.quality import indistinct
 from hks_jax.linear.dissection import dissect
 
 SHAPE = (10, 10)
@@ -202,6 +203,45 @@ def test_gradients_by_symmetric_weights_on_a_torus(dtype):
     expected = jax.grad(total)(tensors, "dense")
     found = jax.grad(total)(tensors, solver)
     assert jnp.linalg.norm(found - expected) < max(1e3 * jnp.finfo(dtype).eps, 1e-9) * jnp.linalg.norm(expected)
+
+
+def disc_with_a_dent():
+    """A disc whose metric is 5000 times smaller near a point."""
+    grid = hj.Grid((40, 40), 2 / 39, (-1, -1))
+    x, y = np.moveaxis(grid.nodes, -1, 0)
+    factor = np.exp(-np.log(5000) * np.exp(-8 * ((x - 0.3) ** 2 + y**2)))
+    return hj.Grid(grid.shape, grid.spacing, grid.origin, x**2 + y**2 < 1), factor
+
+
+def square_with_a_dent(n):
+    """A square whose metric is 10⁴ times smaller at 4 × 4 nodes."""
+    grid, dent = hj.Grid((n, n), 1 / (n - 1)), (slice(n // 2 - 2, n // 2 + 2),) * 2
+    factor = 1 + 0.3 * np.sin(grid.nodes @ [3, 1])
+    factor[dent] /= 1e4
+    return grid, factor
+
+
+@pytest.mark.parametrize(
+    ("case", "k", "least"),
+    [(partial(square_with_a_dent, 20), 7, 0.5), (partial(square_with_a_dent, 24), 7, 1), (disc_with_a_dent, 20, 0.1)],
+    ids=["square", "finer square", "disc"],
+)
+def test_float32_gradients_where_rounding_could_exceed_gaps(rng, case, k, least):
+    """The largest eigenvalue, which bounds rounding, is that of the dent; the lowest ones are far more accurate."""
+    grid, factor = case()
+    tensors, probe = factor[..., None, None] * np.eye(2), np.where(grid.inside, rng.standard_normal(grid.shape), 0)
+
+    def loss(tensors):
+        pairs = hj.eigenpairs(hj.TensorField(grid, tensors), k, solver="shift-invert")
+        signature = hj.hks(pairs, jnp.array([0.02], tensors.dtype))[0]
+        return jnp.sum(jnp.where(grid.inside, probe.astype(tensors.dtype) * signature, 0)), pairs
+
+    (expected, _), (found, pairs) = (
+        jax.grad(loss, has_aux=True)(jnp.asarray(tensors, dtype)) for dtype in (jnp.float64, jnp.float32)
+    )
+    found, expected, bound = map(np.asarray, (found, expected, indistinct(pairs.pencil, pairs.eigenvalues.dtype)))
+    assert bound > least * pairs.eigenvalues[-1]  # gaps, or the whole spectrum
+    assert np.linalg.norm(found - expected) < 1e-4 * np.linalg.norm(expected)
 
 
 class TestGradientsByAField:
