@@ -444,6 +444,27 @@ def test_filters_with_sharp_transitions_or_no_derivative_at_zero(rng, name):
     check(f, FIELDS["generic"](rng), 0.1 * symmetric(rng, SHAPE), step=1e-3)
 
 
+def rise(t, x):
+    return t * x * jnp.exp(-t * x)
+
+
+@pytest.mark.parametrize(("k", "t"), [(1, 0.1), (20, 200.0)])
+@pytest.mark.parametrize("signature", ["custom", "by time"])
+def test_filters_that_vanish_at_zero_have_a_slope_there(signature, k, t):
+    """A constant potential c adds c to each eigenvalue and changes no eigenvector, so Σ f(λᵢ)φᵢ² has Σ f'(λᵢ)φᵢ²."""
+    flat, times = hj.TensorField(hj.Grid((12, 12), 1 / 11), identity((12, 12))), jnp.array([t])
+
+    def of_potential(c):
+        pairs = hj.eigenpairs(hj.assemble(flat, potential=c), k)
+        if signature == "custom":
+            return hj.spectral_signature(pairs, rise, times)[0], pairs
+        return jax.jvp(lambda t: hj.hks(pairs, t)[0], (times,), (-times,))[1], pairs
+
+    _, slope, pairs = jax.jvp(of_potential, (jnp.zeros(()),), (jnp.ones(()),), has_aux=True)
+    slopes = jax.vmap(jax.grad(partial(rise, t)))(pairs.eigenvalues)
+    np.testing.assert_allclose(slope, np.tensordot(slopes, pairs.eigenfunctions**2, 1), rtol=1e-9)
+
+
 @pytest.mark.slow
 def test_parameters_of_the_filters(rng):
     tensors = FIELDS["rotational"](rng)
