@@ -280,3 +280,19 @@ def test_equations_of_nodes_outside_a_mask_are_above_the_spectrum_s_beginning(ma
     dense = pencil.stiffness.to_dense(), pencil.mass.to_dense()
     np.testing.assert_allclose(pairs.eigenvalues, scipy.linalg.eigh(*dense, subset_by_index=[0, k - 1])[0], rtol=1e-10)
     assert (jnp.abs(pairs.vectors).max(axis=1) > 0).all()
+
+
+@pytest.mark.filterwarnings("ignore:k = 5 cuts a multiple eigenvalue")
+@pytest.mark.filterwarnings("ignore:.*solver could not confirm that it missed no")  # for K = 0
+@pytest.mark.parametrize("mass", ["consistent", "lumped"])
+@pytest.mark.parametrize("c", [2.0, -2.0, 0.0])
+def test_equations_of_nodes_outside_a_mask_are_apart_from_a_spectrum_of_one_number(mass, c):
+    n, k = 16, 5
+    grid = hj.Grid((n, n), mask=np.hypot(*(np.indices((n, n)) - (n - 1) / 2)) <= n / 2 - 0.5)
+    pencil = hj.assemble(hj.TensorField(grid, np.tile(np.eye(2), (n, n, 1, 1))), mass=mass)
+    K, M = pencil.stiffness, pencil.mass
+    zero = K.with_flat(jnp.zeros_like(K.flat()))
+    multiple = zero.plus(c * M.diagonal()) if mass == "lumped" else K.with_flat(c * M.flat())
+    pairs = hj.eigenpairs(pencil.with_stiffness(multiple), k, solver="shift-invert")
+    np.testing.assert_allclose(pairs.eigenvalues, np.full(k, c), atol=1e-12)
+    np.testing.assert_allclose(pairs.vectors @ M.apply(pairs.vectors).T, np.eye(k), atol=1e-12)
