@@ -1,7 +1,7 @@
 """The problems of a domain: a function space, or several if the boundary conditions double the domain."""
 
-from collections.abc import Sequence
-from typing import TypeVar
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
@@ -19,7 +19,8 @@ def problems_of(
     """Return the function space of each problem; the first one contains the functions of all problems.
 
     Raises:
-        ValueError: an unknown boundary condition; ``"mirror"`` or ``"mean"`` for a domain that it does not double.
+        ValueError: an unknown boundary condition; ``"mirror"`` or ``"mean"`` for a domain that it does not double, or
+            that has no inner nodes.
 
     Warns:
         AccuracyWarning: the mask does not reach the sides of the grid on which ``"dirichlet"`` acts.
@@ -28,9 +29,10 @@ def problems_of(
         if boundary not in MESH_BOUNDARIES:
             raise ValueError(f"boundary: got {boundary!r}; expected one of {', '.join(map(repr, MESH_BOUNDARIES))}")
         conditions = ("neumann", "dirichlet") if boundary == "mean" else (str(boundary),)
-        return _doubled([mesh_space(domain.triangulation, each, degree) for each in conditions], mirrored=False)
+        of_mesh = _spaces(lambda condition: mesh_space(domain.triangulation, condition, degree), conditions, boundary)
+        return _doubled(of_mesh, mirrored=False)
     sides = normalise_boundary(boundary, domain.grid.dimension)
-    spaces = [grid_space(domain.grid, problem) for problem in doubled_problems(sides)]
+    spaces = _spaces(lambda problem: grid_space(domain.grid, problem), doubled_problems(sides), boundary)
     if any("dirichlet" in pair for pair in sides) and (spaces[0].free == spaces[0].domain).all():
         where = (
             'acts on the sides of the grid, which the mask does not reach. For the rim of the mask pass "dirichlet-rim"'
@@ -39,6 +41,18 @@ def problems_of(
         )
         warn_of_accuracy(f'boundary: got {boundary!r}, but "dirichlet" {where}')
     return _doubled(spaces, mirrored=any("mirror" in pair for pair in sides))
+
+
+def _spaces(space_of: Callable[[Any], S], problems: Sequence[Any], boundary: BoundarySpec) -> list[S]:
+    """Return the space of each problem; raise ValueError if only the first problem has free nodes."""
+    first = space_of(problems[0])
+    try:
+        return [first, *map(space_of, problems[1:])]
+    except ValueError as error:  # the functions of these problems vanish on the rim or at mirrors
+        raise ValueError(
+            f"boundary: got {boundary!r}, but all nodes of the domain are on its rim or sides; the conditions "
+            '"mean" and "mirror" need inner nodes. Pass "neumann", or use a finer grid or mesh, or a thicker mask'
+        ) from error
 
 
 def _doubled(spaces: list[S], mirrored: bool) -> list[S]:

@@ -212,8 +212,14 @@ def test_bad_boundaries_are_named(rng):
     with pytest.raises(ValueError, match='"mean", but the domain has no rim'):
         hj.assemble(hj.examples.sphere_mesh(2), "mean")
     thin = hj.TensorField(hj.Grid((2, 9), mask=np.ones((2, 9), bool)), np.broadcast_to(np.eye(2), (2, 9, 2, 2)))
-    with pytest.raises(ValueError, match=r"every node of the domain is on a Dirichlet side or rim .* a thicker mask"):
-        hj.assemble(thin, "mean")
+    for boundary in ("mean", "mirror", ("mirror", "periodic")):
+        with pytest.raises(ValueError, match=r'all nodes .* on its rim or sides; .* inner nodes\. Pass "neumann"'):
+            hj.assemble(thin, boundary)
+    with pytest.raises(ValueError, match="every node of the domain is on a Dirichlet side or rim"):
+        hj.assemble(thin, ("dirichlet", "neumann", "mean"))
+    triangle = hj.SurfaceMesh(np.eye(3), [[0, 1, 2]])
+    with pytest.raises(ValueError, match=r'all nodes .* on its rim or sides; .* inner nodes\. Pass "neumann"'):
+        hj.assemble(triangle, "mean")
     with pytest.raises(ValueError, match="k: got None"):
         hj.boundary_influence(field, [1.0])
     with pytest.warns(hj.AccuracyWarning, match="acts nowhere: there is no mask"):
