@@ -138,10 +138,11 @@ class DoubledEigenpairs(Eigenpairs, eqx.Module):
         return self.with_problems(each.keeping(mask) for each, mask in zip(self.problems, own, strict=True))
 
 
-# If the function space of problem B includes that of problem A, the j-th eigenvalue of A is not below the j-th
-# eigenvalue of B. If the j-th eigenvalues of both problems are equal, rounding may exchange their order, so that A
-# could have more of the lowest eigenvalues of the doubled domain than `MirrorPencil.including` allows. So eigenvalues
-# are sorted by the maximum of a problem's j-th eigenvalue and those of all problems that include this problem.
+# The j-th eigenvalue of a problem is sorted by the maximum of itself and the j-th eigenvalues of all problems whose
+# function spaces include that of this problem. Without rounding this maximum is the eigenvalue itself, because a larger
+# function space has no larger j-th eigenvalue. If the j-th eigenvalues of two problems are equal, rounding may exchange
+# their order. The problem with the smaller space could then have more of the lowest eigenvalues of the doubled domain
+# than `MirrorPencil.including` allows.
 @numpy_where_known(static_argnums=(1, 2))
 def _order(xp: Any, spectra: Any, including: Including, k: int) -> Any:
     """Return the places (…, k) of the k lowest eigenvalues in the concatenated spectra of all problems."""

@@ -75,8 +75,8 @@ def assemble(
 
     Raises:
         ValueError: an unknown boundary, mass, degree or quadrature; a domain without elements or free nodes; ``"mean"``
-            without a rim; a field that has another shape or contains NaN; a density that is not positive;
-            ``"cancelling"`` with a mesh or a lumped mass.
+            without a rim or without inner nodes; a field that has another shape or contains NaN; a density that is not
+            positive; ``"cancelling"`` with a mesh or a lumped mass.
 
     Warns:
         AccuracyWarning: a Dirichlet condition holds at no node of the domain.

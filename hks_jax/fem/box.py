@@ -66,7 +66,7 @@ def in_box(pencil: Pencil, k: int) -> Pencil:
         vectors = space.extend(nulls.vectors, outside=0.0)
         nulls = NullSpace(vectors.reshape(len(vectors), whole.n_dof), nulls.fixed)
     sums = pencil.row_sums
-    if sums is not None:  # where the row sum is infinite, `read` does not add neighbouring values
+    if sums is not None:  # infinite in the separate equations, so that `Pencil.read` adds nothing to their unknowns
         sums = jnp.where(space.free, space.extend(sums, outside=0.0), jnp.inf).ravel()
     stiffness = StencilOperator(of_stiffness, whole)
     return replace(pencil, stiffness=stiffness, mass=mass, space=whole, null_space=nulls, row_sums=sums)

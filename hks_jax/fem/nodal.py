@@ -60,10 +60,11 @@ class NodalPencil(eqx.Module):
 
         return both
 
-    # Chebyshev iteration with m steps computes P = p(D⁻¹M)D⁻¹ with a fixed polynomial p of degree m − 1; P is therefore
-    # linear and symmetric. For an eigenvalue μ of D⁻¹M in [low, 1], |1 − μ p(μ)| ≤ 1/T_m(σ), where T_m is a Chebyshev
-    # polynomial and σ = (1 + low)/(1 − low). The eigenvalues of D⁻¹M are at most 1 by Gershgorin's theorem, since the
-    # entries of M are not negative.
+    # Chebyshev iteration with m steps solves D⁻¹Mx = D⁻¹r approximately. The result is x = Pr with P = p(D⁻¹M)D⁻¹ and a
+    # fixed polynomial p of degree m − 1, so P is linear and symmetric. For an eigenvalue μ of D⁻¹M in [low, 1],
+    # |1 − μ p(μ)| ≤ 1/T_m(σ), where T_m is a Chebyshev polynomial and σ = (1 + low)/(1 − low). The eigenvalues of D⁻¹M
+    # are at most 1 by Gershgorin's theorem, since the entries of M are not negative. For ζ = 0, `chebyshev_iteration`
+    # returns −p(D⁻¹M)D⁻¹r, hence the minus sign in the code.
     def mass_solve(
         self, low: Float[Array, ""] | float, degree: int
     ) -> Callable[[Float[Array, "*shape b"]], Float[Array, "*shape b"]]:

@@ -34,8 +34,8 @@ class Pencil(SymmetricPencil):
         null_space: the null space of a positive semidefinite K; None if it is not known, and then K may be indefinite.
         lower_bound: a lower bound of the spectrum, if one is known for a K that may be indefinite; derivatives treat it
             as constant.
-        row_sums: (n_dof,) the row sums of M over all nodes, from which `read` computes nodal values; infinite at nodes
-            where functions vanish, and None if the unknowns are nodal values already.
+        row_sums: (n_dof,) the row sums of M over all nodes, from which `read` computes nodal values; infinite in the
+            separate equations of `hks_jax.fem.box.in_box`. None if the unknowns are nodal values already.
         weighted_volume: the integral of 1 with the mass, if a density or Fick's operator has another volume element
             than the metric; None otherwise.
         density: (*node_shape) the density √|D| of Fick's volume element dx with respect to that of the metric D⁻¹; None

@@ -1,4 +1,25 @@
-"""Linear maps in derivative rules: outside `jax.jit`, NumPy computes them, or one compiled program for each."""
+"""Linear maps in derivative rules: outside `jax.jit`, NumPy computes them, or one compiled program for each.
+
+For example, the derivative of the inverse A⁻¹ of a matrix is the linear map dA ↦ −A⁻¹ dA A⁻¹, with the constant A⁻¹::
+
+    def change_of_inverse(inverse, dA):
+        return -inverse @ dA @ inverse
+
+    def by_numpy(inverse):
+        a = np.asarray(inverse)
+        return HostMap(lambda dA: -a @ np.asarray(dA) @ a, lambda like, y: -a.T @ y @ a.T)
+
+    @jax.custom_jvp
+    def inverse_of(A):
+        return jnp.linalg.inv(A)
+
+    @inverse_of.defjvp
+    def _inverse_of_jvp(primals, tangents):
+        inverse = inverse_of(*primals)
+        return inverse, linear_program(change_of_inverse, (), (inverse,), *tangents, inverse, by_numpy)
+
+Forward mode calls the map, and reverse mode its transpose.
+"""
 
 from collections.abc import Callable, Hashable, Sequence
 from functools import partial

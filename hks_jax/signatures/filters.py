@@ -129,7 +129,8 @@ def mixing(
 ) -> tuple[Float[Array, "m k"], Float[Array, "m k k"], Float[Array, "m k k"], Bool[Array, "m k"]]:
     """Return f(λᵢ), the divided differences of f and λf, and marks of pairs that matter, for each filter f.
 
-    Pair i does not matter if λᵢ > 0, and f(λᵢ) and λᵢ f'(λᵢ) are negligible relative to the largest such value.
+    Pair i does not matter if λᵢ > 0, and f(λᵢ) and λᵢ f'(λᵢ) are negligible relative to the largest such value. The
+    marks serve to omit entries (i, j) with i and j beyond the last pair that matters; all others are computed.
     """
     rows, columns = values[:, None], values[None]
     low, high, gap = jnp.minimum(rows, columns), jnp.maximum(rows, columns), rows - columns

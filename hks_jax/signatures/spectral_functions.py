@@ -103,12 +103,15 @@ def _weighted(contraction: Contraction, weights: Float[Array, "m k"], vectors: F
 #
 # The matrix F does not depend on the basis chosen for a multiple eigenvalue, and is finite. If only some pairs are
 # kept, f is set to zero on all others, and the entries of F between kept pairs do not change. The entries of F between
-# a kept pair i and all other pairs j are f(λᵢ) (Gᵢⱼ − λᵢHᵢⱼ)/(λᵢ − λⱼ). These entries add to the differential the sum
+# a kept pair i and a pair j that is not kept are f(λᵢ) (Gᵢⱼ − λᵢHᵢⱼ)/(λᵢ − λⱼ).
+#
+# Only k of the n pairs are known, some of which may not be kept. `mixing` and `changes_between` give the entries of F
+# between the k known pairs. The entries of F between a kept pair i and the unknown pairs add to the differential
 #
 #     Σᵢ f(λᵢ) (φᵢxᵢᵀ + xᵢφᵢᵀ),    xᵢ = (I − ΦΦᵀM) dφᵢ,
 #
-# where Φ has only the kept eigenvectors, and xᵢ is the part of dφᵢ outside their span, the derivative of the frame
-# (hks_jax/eigen/derivative.py).
+# where Φ has the k known eigenvectors, kept or not. So xᵢ is the part of dφᵢ outside the span of all k known
+# eigenvectors, and this is the derivative of the frame (hks_jax/eigen/derivative.py).
 #
 # Signatures use the kernel RΦ f(Λ) ΦᵀRᵀ, where the matrix R maps coefficients to values at the nodes (`Pencil.read`).
 # In the differential of this kernel, R multiplies each φᵢ and xᵢ from the left, and the derivative dR adds the terms
