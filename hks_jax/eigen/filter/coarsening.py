@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hks_jax.compilation import jit_quickly
 from hks_jax.fem.halo import neighbours, with_rim
 from hks_jax.fem.nodal import NodalPencil, lump, to_columns, to_rows
 from hks_jax.fem.space import axis_colours
@@ -19,7 +20,7 @@ from hks_jax.fem.stencil import Stencil
 _COLUMNS = 16
 
 
-@jax.jit
+@jit_quickly()
 def coarsen(fine: NodalPencil) -> NodalPencil:
     """Return PᵀKP and PᵀMP, where P interpolates from every second node of each axis."""
     every_second = (slice(None, None, 2),) * len(fine.shape)

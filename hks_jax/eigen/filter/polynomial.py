@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from hks_jax.compilation import jit_quickly
 from hks_jax.fem.nodal import NodalPencil
 from hks_jax.linear.chebyshev import Columns, chebyshev_iteration, gershgorin, lanczos_bound
 from hks_jax.linear.products import aligned
@@ -94,7 +95,7 @@ def correction(
     return jax.lax.cond(jnp.asarray(terms) > 0, lambda: run(further), lambda: run(lambda y: y))
 
 
-@jax.jit
+@jit_quickly()
 def upper_end(pencil: NodalPencil) -> Float[Array, ""]:
     """Return an upper bound of the spectrum of D⁻¹K, where D is the lumped mass."""
     lumped, sums = pencil.lumped[..., None], pencil.lumped_or_zero[..., None]

@@ -12,6 +12,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.arrays import Scalar
+from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.filter import subspace
 from hks_jax.eigen.filter.coarsening import interpolate
 from hks_jax.eigen.filter.polynomial import Band, correction
@@ -109,7 +110,7 @@ class GridFilter(eqx.Module):
     def _spare(self) -> Bool[np.ndarray, " m"]:
         return np.arange(self.plan.size) >= self.plan.wanted
 
-    @jax.jit
+    @jit_quickly()
     def from_random(self, volume: Scalar) -> FilterState:
         """Return the state after filtering random functions."""
         plan, shape, dtype = self.plan, self.pencil.shape, self.high.dtype
@@ -130,7 +131,7 @@ class GridFilter(eqx.Module):
 
         return subspace.shared(self.slabs, run, EVERYWHERE, _layout(self.slabs))(self, low)
 
-    @jax.jit
+    @jit_quickly()
     def from_rows(self, rows: Float[Array, "m nodes"]) -> FilterState:
         """Return the state in the span of functions on the whole grid."""
         plan, layout = self.plan, _layout(self.slabs)
@@ -141,7 +142,7 @@ class GridFilter(eqx.Module):
 
         return subspace.shared(self.slabs, run, (EVERYWHERE, EVERYWHERE), layout)(self, rows)
 
-    @jax.jit
+    @jit_quickly()
     def from_coarse(self, coarse: "GridFilter", state: FilterState) -> FilterState:
         """Return the state interpolated from the next coarser grid."""
         slabs, shape, block = coarse.slabs, coarse.pencil.shape, self.plan.block
