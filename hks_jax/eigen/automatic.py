@@ -29,6 +29,8 @@ _SMALL = 1500
 # float32, block Lanczos also factorises in float32; so it searches repeatedly, and leaves some pairs unconverged.
 _LARGE, _LARGE_IN_SINGLE = 800_000, 5_000_000
 """The least n·k (unknowns times pairs) for which a solver in JAX is chosen: in general, and for 2D grids in float32."""
+_LARGE_FOR_ONE = 3_000_000
+"""The least n·k for which block Lanczos has the shortest first call in float64 on 2D grids and on surfaces."""
 
 
 def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensolver:
@@ -61,6 +63,14 @@ def choose_for_similar(pencil: AnyPencil, k: int) -> Eigensolver:
     """Return the solver that ``"auto"`` chooses for the first of many similar pencils: never a solver on the host."""
     part, share = pencil.parts[0], -(-k // len(pencil.parts))
     return Dense() if _is_small(part, share) else _in_jax(part, share)
+
+
+def choose_for_one(pencil: AnyPencil, k: int) -> Eigensolver:
+    """Return the solver with the shortest first call, for a process that computes the eigenpairs of one domain."""
+    part, share = pencil.parts[0], -(-k // len(pencil.parts))
+    usual, matrices = choose_solver("auto", part, share), (part.stiffness, part.mass)
+    planar = isinstance(usual, BlockLanczos) and part.space.dimension != 3 and is_concrete_on_cpu(matrices)
+    return ShiftInvert() if planar and part.space.n_dof * share < _LARGE_FOR_ONE else usual
 
 
 def choose_for_fit(pencil: AnyPencil, k: int) -> Eigensolver:

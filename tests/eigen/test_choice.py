@@ -8,7 +8,7 @@ from fields import flat
 
 import hks_jax as hj
 from hks_jax.eigen import automatic
-from hks_jax.eigen.automatic import choose_for_fit, choose_solver
+from hks_jax.eigen.automatic import choose_for_fit, choose_for_one, choose_solver
 
 
 def single(pencil):
@@ -111,6 +111,16 @@ def test_the_problems_of_a_doubled_domain_share_the_pairs(monkeypatch):
     monkeypatch.setattr(automatic, "_LARGE", 30 * field.grid.size)
     assert hj.eigenpairs(field, 40, "mean").solver_name == "shift-invert"
     assert choose_solver("auto", hj.assemble(field), 40).name == "block-lanczos"
+
+
+def test_a_process_with_one_domain_takes_shift_invert_for_more_pairs(monkeypatch):
+    pencil = hj.assemble(hj.TensorField(hj.Grid((42, 41)), np.broadcast_to(np.diag([1.0, 2.0]), (42, 41, 2, 2))))
+    monkeypatch.setattr(automatic, "_LARGE", 30 * pencil.space.n_dof)
+    monkeypatch.setattr(automatic, "_LARGE_FOR_ONE", 60 * pencil.space.n_dof)
+    assert [choose_solver("auto", pencil, k).name for k in (20, 40, 80)] == ["shift-invert", *["block-lanczos"] * 2]
+    assert [choose_for_one(pencil, k).name for k in (20, 40, 80)] == [*["shift-invert"] * 2, "block-lanczos"]
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert choose_for_one(pencil, 40).name == "block-lanczos"
 
 
 @pytest.mark.slow

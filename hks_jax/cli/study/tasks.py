@@ -272,7 +272,7 @@ def _pairs(study: Study, subject: Subject, progress: StudyProgress) -> Solved:
     kept.unlink(missing_ok=True)
     volume = read_volume(Reading.of(subject.args), progress)
     domain = domain_of_volume(volume, study.settings, format_of(subject.args.file).image)
-    solved = compute_pairs(domain, study.settings, progress)
+    solved = compute_pairs(domain, study.settings, progress, "other")
     if study.save_pairs:
         with progress.stage("writing"):
             write_pairs(kept, solved, progress.warnings, fingerprint)

@@ -138,6 +138,7 @@ def _iterate(
     grids = [_replicated(plan.mesh, GridFilter(nodal, upper_end(nodal), plan)) for nodal in nested]
     rounding, grid = indistinct(pencil, grids[0].high.dtype), grids.pop()
     if start is None:
+        assert pencil.volume is not None
         state = grid.from_random(pencil.volume)
     else:
         state = grid.from_rows(pencil.space.extend(start, outside=0.0).reshape(plan.size, -1))
