@@ -238,7 +238,7 @@ def solver_of(settings: Settings, pencil: hj.Pencil | hj.MirrorPencil, k: int, f
     eigenpairs of similar pencils will start from these.
     """
     many = first and settings.solver == "auto"
-    solver = choose_for_similar(pencil, k) if many else choose_solvers(settings.solver, pencil, k)[0]
+    solver = choose_for_similar(pencil, k) if many else choose_solvers(settings.solver, pencil, k)[0][0]
     if not isinstance(solver, hj.ChebyshevFilter):
         return settings.solver
     return replace(solver, tolerance=_TOLERANCE, keep_spare=first)
@@ -264,7 +264,7 @@ def compute_pairs(domain: OfVolume | OfMesh, settings: Settings, progress: Progr
     k = default_k(dimension, unknowns) if settings.k is None else settings.k
     _tell_of_resolution(k, pencil, domain, settings, progress)
     solver = solver_of(settings, pencil, k, first)
-    with progress.stage("eigenpairs", f"{k} of {unknowns} by {choose_solvers(solver, pencil, k)[0].name}"):
+    with progress.stage("eigenpairs", f"{k} of {unknowns} by {choose_solvers(solver, pencil, k)[0][0].name}"):
         pairs = hj.eigenpairs(pencil, k, solver=solver, progress=progress.update)
         jax.block_until_ready(pairs.eigenvalues)
     if not np.asarray(pairs.converged).all():

@@ -45,8 +45,9 @@ def solved(
     bound as constants. Derivatives whose linear solves do not converge are NaN, and raise an error if ``throw`` is set,
     or else cause a warning if values are concrete.
     """
-    values, vectors, complete_below = _computed(solver, pencil, k + extra, report, start)
-    return *_cut(values, vectors, k), complete_below, vectors[k:] if len(vectors) > k + extra else None
+    values, vectors, complete_below = one_by_one(_lowest, (solver, k + extra, report), pencil, start)
+    *found, spare = _cut(values, vectors, k)
+    return *found, complete_below, spare
 
 
 # Let fᵢ = (dK − λᵢ dM) φᵢ, called the force. From Kφᵢ = λᵢMφᵢ and φᵢᵀMφⱼ = δᵢⱼ it follows that
@@ -67,11 +68,10 @@ def _solved_jvp(
 ) -> tuple[tuple, tuple]:
     pencil, start, change = first_order_only(primals[0]), primals[1], changes[0]
     n_dof, adjoint = pencil.size, solver.adjoint
-    spare = max(extra, min(solver.guards(k, n_dof), solver.max_pairs(n_dof) - k))
-    values, vectors, complete_below = _computed(solver, pencil, k + spare, report, start)
-    kept = vectors[k:] if len(vectors) > k + spare else None
-    vectors = vectors if kept is None else vectors[: k + spare]
-    eigenvalues, functions, following = _cut(values, vectors, k)
+    guards = max(extra, min(solver.guards(k, n_dof), solver.max_pairs(n_dof) - k))
+    values, vectors, complete_below = one_by_one(_lowest, (solver, k + guards, report), pencil, start)
+    eigenvalues, functions, following, spare = _cut(values, vectors, k)
+    vectors = vectors if spare is None else vectors[: len(values)]
     origin, solves = jnp.zeros((), values.dtype), _solves(pencil, k, len(values))
     if solves and pencil.null_space is None:  # linear solves need K ⪰ 0
         origin = _below(values, indistinct(pencil, values.dtype))
@@ -83,7 +83,7 @@ def _solved_jvp(
     on_failure: OnFailure = "error" if throw else "nothing" if is_traced(primals) else "warning"
     known, settings = _Known(prepared, pencil, origin, values, vectors, functions), (adjoint, on_failure)
     tangents = linear_program(_tangents, settings, (known,), change, (eigenvalues, functions), _by_numpy)
-    constants = following if extra else jnp.full_like(following, jnp.inf), complete_below, kept
+    constants = following if extra else jnp.full_like(following, jnp.inf), complete_below, spare
     return (eigenvalues, functions, *constants), (*tangents, *jax.tree.map(jnp.zeros_like, constants))
 
 
@@ -98,16 +98,21 @@ class _Known(NamedTuple):
     functions: Rows  # the first k vectors, because slicing ``vectors`` would copy the slice
 
 
-def _computed(solver: Eigensolver, pencil: Pencil, k: int, report: Report, start: Array | None) -> RawPairs:
-    values, vectors, bound = one_by_one(_by_solver, (solver, k, report), pencil, start)
+# `one_by_one` needs the same function object in every call; so `_lowest` and `_prepare` are at module level.
+def _lowest(solver: Eigensolver, k: int, report: Report, pencil: SymmetricPencil, start: Array | None) -> RawPairs:
+    """Return the solver's pairs with the exact null vectors of the pencil."""
+    lowest: Any = solver.lowest
+    values, vectors, bound = lowest(pencil, k, report, start) if solver.starts else lowest(pencil, k, report)
     if pencil.null_space is not None and pencil.n_null:
         values, vectors = _with_null_modes(pencil.mass, pencil.null_space.vectors, values, vectors)
     return values, vectors, bound
 
 
 @numpy_where_known(static_argnums=2)
-def _cut(xp: Any, values: Any, vectors: Any, k: int) -> tuple[Any, Any, Any]:
-    return values[:k], vectors[:k], values[k] if len(values) > k else xp.asarray(xp.inf, values.dtype)
+def _cut(xp: Any, values: Any, vectors: Any, k: int) -> tuple[Any, Any, Any, Any]:
+    """Return k pairs, the next eigenvalue and, if the solver returned more vectors than pairs, those after the k-th."""
+    following = values[k] if len(values) > k else xp.asarray(xp.inf, values.dtype)
+    return values[:k], vectors[:k], following, vectors[k:] if len(vectors) > len(values) else None
 
 
 @numpy_where_known()
@@ -192,12 +197,6 @@ def _tangents(adjoint: Adjoint, on_failure: OnFailure, known: _Known, change: Sy
         rhs = jnp.where(free, -force, 0)
         frame = frame + jnp.where(free, jax.lax.custom_linear_solve(lambda x: x, rhs, solve, symmetric=True), 0)
     return jnp.sum(functions * force, axis=1), frame
-
-
-# `one_by_one` needs the same function object in every call; so the next two functions are at module level.
-def _by_solver(solver: Eigensolver, k: int, report: Report, pencil: SymmetricPencil, start: Array | None) -> RawPairs:
-    lowest: Any = solver.lowest
-    return lowest(pencil, k, report, start) if solver.starts else lowest(pencil, k, report)
 
 
 def _prepare(adjoint: Adjoint, k: int, pencil: SymmetricPencil, values: Values) -> Any:

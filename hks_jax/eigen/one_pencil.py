@@ -14,7 +14,7 @@ from hks_jax.eigen.derivative import solved
 from hks_jax.eigen.eigenpairs import UNCERTAIN, PencilEigenpairs
 from hks_jax.eigen.quality import allowed_residuals, indistinct, largest, largest_of, measure_pairs, measured_on_host
 from hks_jax.eigen.solver import Dense, Eigensolver, Report
-from hks_jax.fem.box import from_box, in_box, to_box
+from hks_jax.fem.box import cropped, in_box
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import MatrixSpace
 from hks_jax.linear.host_matrices import balanced, near_zero
@@ -25,78 +25,84 @@ def pairs_of_pencil(
     pencil: Pencil,
     solver: Eigensolver,
     k: int,
-    extra: int,
     throw: bool,
     report: Report,
-    start: PencilEigenpairs | None = None,
+    start: Float[Array, "m n_dof"] | None = None,
 ) -> PencilEigenpairs:
-    """Return the k lowest pairs and, if ``extra`` = 1, the next eigenvalue. See `solved` for ``throw``."""
-    given, pencil = pencil, pencil if isinstance(solver, Dense) else in_box(pencil, k + extra)
+    """Return the k lowest pairs; see `solved` for ``throw``, and `Eigensolver.starts` for ``start``."""
+    extra = min(1, pencil.size - k)  # the next eigenvalue shows whether k cuts a multiple eigenvalue
     solver.require(pencil)
-    pencil, n_dof, most = _with_balance(pencil), pencil.size, solver.max_pairs(pencil.size)
-    if k + extra > most and pencil.null_space is None:
-        solver = Dense(solver.tolerance)
-    elif k + extra > most:
-        if most < 2:
-            raise ValueError(
-                f"solver: got {solver.name!r} for {n_dof} unknowns, which are too few for it. Use the dense solver"
-            )
-        raise ValueError(
-            f"k: got {k}, for which {k + extra} pairs are needed (one more shows where the spectrum is cut); the "
-            f"{solver.name} solver computes at most {most} of {n_dof} pairs. Use a smaller k or the dense solver"
-        )
-    rows = None
-    if start is not None and start.spare is not None:
-        rows = start.space.transfer(jnp.concatenate([start.frame, start.spare]), given.space)
-        rows = to_box(rows, given.space, pencil.space)
-    pairs = _pairs(pencil, solved(solver, pencil, k, extra, throw, report, rows), solver)
-    frame = from_box(pairs.frame, pencil.space, given.space)
-    spare = None if pairs.spare is None else from_box(pairs.spare, pencil.space, given.space)
-    return replace(pairs, frame=frame, spare=spare, pencil=given)
-
-
-def _with_balance(pencil: Pencil) -> Pencil:
-    """Return a float32 pencil of the user's own K with the null vectors of K that rounding hides; see `balanced`."""
-    known, own = jax.lax.stop_gradient(pencil), isinstance(pencil.space, MatrixSpace) or pencil.volume is None
-    if pencil.null_space is not None or not own or not _single_on_host(known.stiffness, known.stiffness):
-        return pencil
-    source = replace(known.unrounded, null_vectors=balanced(known))
-    return replace(pencil, source=source)
-
-
-def _single_on_host(values: Any, args: Any) -> bool:
-    return values.dtype == np.float32 and is_concrete_on_cpu(args)
-
-
-def _pairs(pencil: Pencil, found: tuple[Any, ...], solver: Eigensolver) -> PencilEigenpairs:
-    """Return the `PencilEigenpairs` of a pencil, given the result of `solved`."""
-    values, frame, following, bound, spare = found
-    known, double = pencil.null_space is not None, solver.in_double
-    constants = jax.lax.stop_gradient((pencil, frame, values, following))
-    matrices = tabulated(SymmetricPencil(constants[0].stiffness, constants[0].mass))
-    stored = double and _single_on_host(values, constants)
-    settings = pencil.n_null, solver.tolerance, known, stored
-    quality = _quality(matrices, *constants[1:], constants[0].lower_bound, *settings)
-    residuals, converged, zero, tolerance = quality
-    small, rounding = _near_zero(*constants[:3], zero, double)
-    if not known:
-        values = _with_small(values, constants[2], zero, small)
+    inner = boxed = pencil
+    if not isinstance(solver, Dense):
+        inner = cropped(pencil)  # with the same unknowns
+        boxed = in_box(inner, k + extra)
+    rows = None if start is None else inner.space.transfer(start, boxed.space)
+    # Only in float32 does rounding of the matrices matter, and only NumPy on the host computes more accurately.
+    rounded = boxed.stiffness.dtype == np.float32 and is_concrete_on_cpu(jax.lax.stop_gradient((boxed, rows)))
+    solver = _able(solver, boxed, k, extra)
+    boxed = _with_balance(boxed) if rounded else boxed
+    values, frame, following, bound, spare = solved(solver, boxed, k, extra, throw, report, rows)
+    values, quality = _judged(boxed, solver, values, frame, following, rounded)
     # While differentiating, JAX may turn a constant array into a Python number.
     return PencilEigenpairs(
         eigenvalues=values,
-        residuals=residuals,
-        converged=converged,
-        rounding=rounding,
-        kept=jax_array(np.ones(values.size, bool)),
+        kept=jax_array(np.ones(k, bool)),
         next_eigenvalue=jax_array(following),
         complete_below=jax_array(bound),
-        spectral_origin=jnp.zeros((), values.dtype) if known else jax.lax.stop_gradient(values[0]),
-        multiplet_tolerance=tolerance,
-        frame=frame,
+        frame=boxed.space.transfer(frame, inner.space),
         pencil=pencil,
         solver_name=solver.name,
-        spare=spare,
+        spare=None if spare is None else boxed.space.transfer(spare, inner.space),
+        **quality,
     )
+
+
+def _able(solver: Eigensolver, pencil: Pencil, k: int, extra: int) -> Eigensolver:
+    """Return the solver or, if it cannot compute so many pairs of a K that may be indefinite, the dense one."""
+    n_dof, most = pencil.size, solver.max_pairs(pencil.size)
+    if k + extra <= most:
+        return solver
+    if pencil.null_space is None:
+        return Dense(solver.tolerance)
+    if most < 2:
+        raise ValueError(
+            f"solver: got {solver.name!r} for {n_dof} unknowns, which are too few for it. Use the dense solver"
+        )
+    raise ValueError(
+        f"k: got {k}, for which {k + extra} pairs are needed (one more shows where the spectrum is cut); the "
+        f"{solver.name} solver computes at most {most} of {n_dof} pairs. Use a smaller k or the dense solver"
+    )
+
+
+def _with_balance(pencil: Pencil) -> Pencil:
+    """Return the pencil of the user's own K with the null vectors that rounding to float32 hides; see `balanced`."""
+    users = isinstance(pencil.space, MatrixSpace) or pencil.volume is None
+    if pencil.null_space is not None or not users:
+        return pencil
+    constant = jax.lax.stop_gradient(pencil)
+    return replace(pencil, source=replace(constant.unrounded, null_vectors=balanced(constant)))
+
+
+def _judged(
+    pencil: Pencil, solver: Eigensolver, values: Array, vectors: Array, following: Array, rounded: bool
+) -> tuple[Array, dict[str, Array]]:
+    """Return the eigenvalues, where those near zero may be more accurate, and the indicators of the pairs' quality."""
+    null_space_known = pencil.null_space is not None
+    constants = jax.lax.stop_gradient((pencil, vectors, values, following))
+    matrices = tabulated(SymmetricPencil(constants[0].stiffness, constants[0].mass))
+    settings = pencil.n_null, solver.tolerance, null_space_known, solver.in_double and rounded
+    residuals, converged, zero, tolerance = _quality(matrices, *constants[1:], constants[0].lower_bound, *settings)
+    small, rounding = _near_zero(*constants[:3], zero, solver.in_double, rounded)
+    if not null_space_known:
+        values = _with_small(values, constants[2], zero, small)
+    origin = jnp.zeros((), values.dtype) if null_space_known else jax.lax.stop_gradient(values[0])
+    return values, {
+        "residuals": residuals,
+        "converged": converged,
+        "rounding": rounding,
+        "multiplet_tolerance": tolerance,
+        "spectral_origin": origin,
+    }
 
 
 @numpy_where_known()
@@ -106,7 +112,7 @@ def _with_small(xp: Any, values: Any, constant: Any, zero: Any, small: Any) -> A
 
 
 def _near_zero(
-    pencil: Pencil, vectors: Array, values: Array, zero: Array, accurate: bool
+    pencil: Pencil, vectors: Array, values: Array, zero: Array, accurate: bool, rounded: bool
 ) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
     """Return the eigenvalues that are zero within rounding, with 0 for the others, and `Eigenpairs.rounding`.
 
@@ -116,7 +122,7 @@ def _near_zero(
     nothing, known = jax_array(np.zeros(values.shape, values.dtype)), pencil.null_space is not None
     if values.dtype != np.float32:
         return nothing, nothing
-    if not _single_on_host(values, (pencil, vectors, values)):
+    if not rounded:
         return nothing, nothing if known else jnp.where(zero, indistinct(pencil, values.dtype), 0)
     small, rounding = np.zeros((2, values.size), np.float32)
     near = np.abs(np.asarray(values)) <= float(indistinct(pencil, values.dtype)) / UNCERTAIN

@@ -16,7 +16,7 @@ from hks_jax.fem.fields import checked_field
 from hks_jax.fem.forms import Form, WeakForm, l2, laplace_beltrami
 from hks_jax.fem.integrals import assemble_grid, assemble_mesh, grid_points, mesh_nodes, mesh_points
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
-from hks_jax.fem.problems import inclusions, problems_of
+from hks_jax.fem.problems import problems_of
 from hks_jax.linear.operators import PatternedOperator, require_symmetric
 from hks_jax.traced import is_traced
 
@@ -218,4 +218,4 @@ def _assembled(
             matrix = getattr(pencils[0], name)
             if isinstance(matrix, PatternedOperator):
                 require_symmetric(name, *matrix.triplets(), matrix.size, "Make the form symmetric in u and v")
-    return pencils[0] if len(pencils) == 1 else MirrorPencil(tuple(pencils), inclusions(spaces))
+    return pencils[0] if len(pencils) == 1 else MirrorPencil(tuple(pencils))

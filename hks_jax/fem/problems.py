@@ -1,16 +1,12 @@
 """The problems of a domain: a function space, or several if the boundary conditions double the domain."""
 
-from collections.abc import Sequence
-from typing import TypeVar
-
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.boundary import BoundarySpec, doubled_problems, normalise_boundary
-from hks_jax.fem.space import FunctionSpace, GridSpace, MeshSpace, grid_space, mesh_space
+from hks_jax.fem.space import GridSpace, MeshSpace, grid_space, mesh_space
 
 MESH_BOUNDARIES = ("neumann", "dirichlet", "mean")
-S = TypeVar("S", bound=FunctionSpace)
 
 
 def problems_of(
@@ -24,36 +20,29 @@ def problems_of(
     Warns:
         AccuracyWarning: the mask does not reach the sides of the grid on which ``"dirichlet"`` acts.
     """
+    spaces: list[GridSpace] | list[MeshSpace]
     if isinstance(domain, SimplicialMesh):
         if boundary not in MESH_BOUNDARIES:
             raise ValueError(f"boundary: got {boundary!r}; expected one of {', '.join(map(repr, MESH_BOUNDARIES))}")
         conditions = ("neumann", "dirichlet") if boundary == "mean" else (str(boundary),)
-        return _doubled([mesh_space(domain.triangulation, each, degree) for each in conditions], mirrored=False)
-    sides = normalise_boundary(boundary, domain.grid.dimension)
-    spaces = [grid_space(domain.grid, problem) for problem in doubled_problems(sides)]
-    if any("dirichlet" in pair for pair in sides) and (spaces[0].free == spaces[0].domain).all():
-        where = (
-            'acts on the sides of the grid, which the mask does not reach. For the rim of the mask pass "dirichlet-rim"'
-            if sides[-1] == ("neumann", "neumann")
-            else "acts nowhere: there is no mask, and so no rim. Leave this condition out"
-        )
-        warn_of_accuracy(f'boundary: got {boundary!r}, but "dirichlet" {where}')
-    return _doubled(spaces, mirrored=any("mirror" in pair for pair in sides))
-
-
-def _doubled(spaces: list[S], mirrored: bool) -> list[S]:
-    """Return the spaces of all problems; raise ValueError if all of them are the same."""
-    if len(spaces) == 1 or spaces[0].n_dof > spaces[-1].n_dof:
-        return spaces
-    if mirrored:
+        spaces, mirrored = [mesh_space(domain.triangulation, each, degree) for each in conditions], False
+    else:
+        sides = normalise_boundary(boundary, domain.grid.dimension)
+        spaces = [grid_space(domain.grid, problem) for problem in doubled_problems(sides)]
+        mirrored = any("mirror" in pair for pair in sides)
+        if any("dirichlet" in pair for pair in sides) and (spaces[0].free == spaces[0].domain).all():
+            where = (
+                "acts on the sides of the grid, which the mask does not reach. For the rim of the mask pass "
+                '"dirichlet-rim"'
+                if sides[-1] == ("neumann", "neumann")
+                else "acts nowhere: there is no mask, and so no rim. Leave this condition out"
+            )
+            warn_of_accuracy(f'boundary: got {boundary!r}, but "dirichlet" {where}')
+    if len(spaces) > 1 and spaces[0].n_dof == spaces[-1].n_dof:  # all problems are the same
         raise ValueError(
             'boundary: got "mirror", but the mask reaches no side of the grid, where the mirrors are. Pass "mean" '
             "for the rim of the mask"
+            if mirrored
+            else 'boundary: got "mean", but the domain has no rim; pass "neumann"'
         )
-    raise ValueError('boundary: got "mean", but the domain has no rim; pass "neumann"')
-
-
-def inclusions(spaces: Sequence[FunctionSpace]) -> tuple[tuple[int, ...], ...]:
-    """Return, for each space, itself and the earlier spaces that contain its functions; see `MirrorPencil`."""
-    free = [space.free for space in spaces]
-    return tuple(tuple(j for j in range(i + 1) if not (own & ~free[j]).any()) for i, own in enumerate(free))
+    return spaces
