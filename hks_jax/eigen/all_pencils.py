@@ -130,8 +130,8 @@ def _solved(problem: _Problem, k: int, throw: bool, report: Report) -> PencilEig
 
 
 def _is_doubtful(pairs: PencilEigenpairs) -> bool:
-    known = jax.lax.stop_gradient(pairs)
-    return bool(known.unconfirmed or not known.converged.all())
+    found = jax.lax.stop_gradient(pairs)
+    return bool(found.unconfirmed or not found.converged.all())
 
 
 def _missing(problems: list[_Problem], pairs: dict[int, PencilEigenpairs], k: int) -> list[int]:
@@ -139,10 +139,10 @@ def _missing(problems: list[_Problem], pairs: dict[int, PencilEigenpairs], k: in
     more = [min(each.limit, 2 * pairs[i].k) if pairs[i].k < each.limit else 0 for i, each in enumerate(problems)]
     if not any(more):
         return more
-    known = jax.lax.stop_gradient([(each.eigenvalues, each.next_eigenvalue) for each in pairs.values()])
-    merged = np.sort(np.concatenate([np.append(*each) for each in known]))
+    spectra = jax.lax.stop_gradient([(each.eigenvalues, each.next_eigenvalue) for each in pairs.values()])
+    merged = np.sort(np.concatenate([np.append(*each) for each in spectra]))
     reach = merged[k] if merged.size > k else np.inf
-    return [0 if end >= reach else number for number, (_, end) in zip(more, known, strict=True)]
+    return [0 if end >= reach else number for number, (_, end) in zip(more, spectra, strict=True)]
 
 
 def _of_problem(report: Report, number: int, wanted: list[int]) -> Report:

@@ -81,13 +81,13 @@ def _solved_jvp(
     # Metric and density are removed: derivatives do not need them, and reverse mode would store their arrays.
     pencil = replace(pencil, metric=None, density=None)
     on_failure: OnFailure = "error" if throw else "nothing" if is_traced(primals) else "warning"
-    known, settings = _Known(prepared, pencil, origin, values, vectors, functions), (adjoint, on_failure)
-    tangents = linear_program(_tangents, settings, (known,), change, (eigenvalues, functions), _by_numpy)
-    constants = following if extra else jnp.full_like(following, jnp.inf), complete_below, spare
-    return (eigenvalues, functions, *constants), (*tangents, *jax.tree.map(jnp.zeros_like, constants))
+    constants, settings = _Constants(prepared, pencil, origin, values, vectors, functions), (adjoint, on_failure)
+    tangents = linear_program(_tangents, settings, (constants,), change, (eigenvalues, functions), _by_numpy)
+    others = following if extra else jnp.full_like(following, jnp.inf), complete_below, spare
+    return (eigenvalues, functions, *others), (*tangents, *jax.tree.map(jnp.zeros_like, others))
 
 
-class _Known(NamedTuple):
+class _Constants(NamedTuple):
     """The constants of the derivative: the matrices K − σM and M, their first p eigenpairs, and k of the vectors."""
 
     prepared: Any  # the result of `Adjoint.prepare`
@@ -127,9 +127,9 @@ def _solves(pencil: SymmetricPencil, k: int, p: int) -> bool:
     return p < pencil.size and pencil.n_fixed < k
 
 
-def _by_numpy(adjoint: Adjoint, on_failure: OnFailure, known: _Known) -> HostMap | None:
+def _by_numpy(adjoint: Adjoint, on_failure: OnFailure, constants: _Constants) -> HostMap | None:
     """Return `_tangents` by NumPy."""
-    prepared, pencil, origin, values, vectors, functions = known
+    prepared, pencil, origin, values, vectors, functions = constants
     if vectors.size > _ON_HOST:
         return None
     k, rows = len(functions), np.asarray(functions)
@@ -172,9 +172,11 @@ def change_of(change: SymmetricPencil, x: Rows, *p: Rows) -> SymmetricPencil:
 
 # Without the checkpoint, reverse mode would store copies of the eigenvectors.
 @partial(jax.checkpoint, static_argnums=(0, 1))
-def _tangents(adjoint: Adjoint, on_failure: OnFailure, known: _Known, change: SymmetricPencil) -> tuple[OfRows, Rows]:
+def _tangents(
+    adjoint: Adjoint, on_failure: OnFailure, constants: _Constants, change: SymmetricPencil
+) -> tuple[OfRows, Rows]:
     """Return the tangents of the first k eigenvalues, and of the frame of `solved`, for the change of K and M."""
-    prepared, pencil, origin, values, vectors, functions = known
+    prepared, pencil, origin, values, vectors, functions = constants
     k = len(functions)
     eigenvalues, guards = values[:k] + origin, vectors[k:]
     moved = change.mass.apply(functions)
@@ -188,15 +190,15 @@ def _tangents(adjoint: Adjoint, on_failure: OnFailure, known: _Known, change: Sy
     def solve(_: object, rhs: Rows) -> Rows:
         return _checked(on_failure, one_by_one(type(adjoint).solve, (adjoint,), prepared, pencil, values, vectors, rhs))
 
-    frame = with_transpose(onto_guards, onto_guards, force)
+    of_frame = with_transpose(onto_guards, onto_guards, force)
     if _solves(pencil, k, len(values)):
         # If every perturbation of K annihilates a null vector φᵢ, its force fᵢ is zero, and so is xᵢ. In reverse mode,
         # a cotangent that may be nonzero replaces fᵢ, so xᵢ is set to zero for such null vectors. JAX would
         # use products with K − λᵢM only in second derivatives, which are not supported; the identity replaces them.
         free = np.arange(k)[:, None] >= pencil.n_fixed
         rhs = jnp.where(free, -force, 0)
-        frame = frame + jnp.where(free, jax.lax.custom_linear_solve(lambda x: x, rhs, solve, symmetric=True), 0)
-    return jnp.sum(functions * force, axis=1), frame
+        of_frame = of_frame + jnp.where(free, jax.lax.custom_linear_solve(lambda x: x, rhs, solve, symmetric=True), 0)
+    return jnp.sum(functions * force, axis=1), of_frame
 
 
 def _prepare(adjoint: Adjoint, k: int, pencil: SymmetricPencil, values: Values) -> Any:

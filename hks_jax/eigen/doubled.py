@@ -63,8 +63,8 @@ class DoubledEigenpairs(Eigenpairs, eqx.Module):
     @property
     def _known_order(self) -> Int[Array, " k"]:
         order = self.order
-        known = None if is_traced(order) or order.dtype == jax.dtypes.float0 else np.sort(np.asarray(order), axis=-1)
-        if order.dtype == jax.dtypes.float0 or (known is not None and (np.diff(known, axis=-1) == 0).any()):
+        places = None if is_traced(order) or order.dtype == jax.dtypes.float0 else np.sort(np.asarray(order), axis=-1)
+        if order.dtype == jax.dtypes.float0 or (places is not None and (np.diff(places, axis=-1) == 0).any()):
             raise ValueError(
                 'pairs: got a derivative or difference of eigenpairs with the boundary "mean" or "mirror", which does '
                 "not know the order of the eigenvalues. Differentiate a function that returns `pairs.eigenvalues` or "

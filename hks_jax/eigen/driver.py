@@ -95,13 +95,13 @@ def eigenpairs(
     k = int(number)
     size = min(k + SPARE, total) if multiplet == "complete" else k
     pairs = pairs_of_pencils(pencil, solver, size, throw, progress or silent, start).truncated(k, multiplet)
-    known = jax.lax.stop_gradient(pairs)
-    if is_traced(known.eigenvalues):
-        return known.result.error_if(pairs, known.result != RESULTS.successful) if throw else pairs
-    if throw and known.result != RESULTS.successful:
+    found = jax.lax.stop_gradient(pairs)
+    if is_traced(found.eigenvalues):
+        return found.result.error_if(pairs, found.result != RESULTS.successful) if throw else pairs
+    if throw and found.result != RESULTS.successful:
         codes: Any = RESULTS  # mypy sees its members as strings
-        raise RuntimeError(codes[known.result])
-    for message in known.messages():
+        raise RuntimeError(codes[found.result])
+    for message in found.messages():
         warn_of_accuracy(message)
     return pairs
 

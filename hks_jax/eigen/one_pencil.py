@@ -37,12 +37,12 @@ def pairs_of_pencil(
         inner = cropped(pencil)  # with the same unknowns
         boxed = in_box(inner, k + extra)
     rows = None if start is None else inner.space.transfer(start, boxed.space)
-    # Only in float32 does rounding of the matrices matter, and only NumPy on the host computes more accurately.
-    rounded = boxed.stiffness.dtype == np.float32 and is_concrete_on_cpu(jax.lax.stop_gradient((boxed, rows)))
+    # Where NumPy computes in float64, it finds null vectors and eigenvalues near zero that rounding to float32 hides.
+    single_on_host = boxed.stiffness.dtype == np.float32 and is_concrete_on_cpu(jax.lax.stop_gradient((boxed, rows)))
     solver = _able(solver, boxed, k, extra)
-    boxed = _with_balance(boxed) if rounded else boxed
+    boxed = _with_balance(boxed) if single_on_host else boxed
     values, frame, following, bound, spare = solved(solver, boxed, k, extra, throw, report, rows)
-    values, quality = _judged(boxed, solver, values, frame, following, rounded)
+    values, quality = _judged(boxed, solver, values, frame, following, single_on_host)
     # While differentiating, JAX may turn a constant array into a Python number.
     return PencilEigenpairs(
         eigenvalues=values,
@@ -76,23 +76,23 @@ def _able(solver: Eigensolver, pencil: Pencil, k: int, extra: int) -> Eigensolve
 
 def _with_balance(pencil: Pencil) -> Pencil:
     """Return the pencil of the user's own K with the null vectors that rounding to float32 hides; see `balanced`."""
-    users = isinstance(pencil.space, MatrixSpace) or pencil.volume is None
-    if pencil.null_space is not None or not users:
+    custom = isinstance(pencil.space, MatrixSpace) or pencil.volume is None
+    if pencil.null_space is not None or not custom:
         return pencil
     constant = jax.lax.stop_gradient(pencil)
     return replace(pencil, source=replace(constant.unrounded, null_vectors=balanced(constant)))
 
 
 def _judged(
-    pencil: Pencil, solver: Eigensolver, values: Array, vectors: Array, following: Array, rounded: bool
+    pencil: Pencil, solver: Eigensolver, values: Array, vectors: Array, following: Array, single_on_host: bool
 ) -> tuple[Array, dict[str, Array]]:
     """Return the eigenvalues, where those near zero may be more accurate, and the indicators of the pairs' quality."""
     null_space_known = pencil.null_space is not None
     constants = jax.lax.stop_gradient((pencil, vectors, values, following))
     matrices = tabulated(SymmetricPencil(constants[0].stiffness, constants[0].mass))
-    settings = pencil.n_null, solver.tolerance, null_space_known, solver.in_double and rounded
+    settings = pencil.n_null, solver.tolerance, null_space_known, solver.in_double and single_on_host
     residuals, converged, zero, tolerance = _quality(matrices, *constants[1:], constants[0].lower_bound, *settings)
-    small, rounding = _near_zero(*constants[:3], zero, solver.in_double, rounded)
+    small, rounding = _near_zero(*constants[:3], zero, solver.in_double, single_on_host)
     if not null_space_known:
         values = _with_small(values, constants[2], zero, small)
     origin = jnp.zeros((), values.dtype) if null_space_known else jax.lax.stop_gradient(values[0])
@@ -112,18 +112,18 @@ def _with_small(xp: Any, values: Any, constant: Any, zero: Any, small: Any) -> A
 
 
 def _near_zero(
-    pencil: Pencil, vectors: Array, values: Array, zero: Array, accurate: bool, rounded: bool
+    pencil: Pencil, vectors: Array, values: Array, zero: Array, accurate: bool, single_on_host: bool
 ) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
     """Return the eigenvalues that are zero within rounding, with 0 for the others, and `Eigenpairs.rounding`.
 
     In float32, eigenvalues that are zero within rounding may be accurate in float64, in which the host computes.
     ``accurate`` states whether the solver computed in float64.
     """
-    nothing, known = jax_array(np.zeros(values.shape, values.dtype)), pencil.null_space is not None
+    nothing, null_space_known = jax_array(np.zeros(values.shape, values.dtype)), pencil.null_space is not None
     if values.dtype != np.float32:
         return nothing, nothing
-    if not rounded:
-        return nothing, nothing if known else jnp.where(zero, indistinct(pencil, values.dtype), 0)
+    if not single_on_host:
+        return nothing, nothing if null_space_known else jnp.where(zero, indistinct(pencil, values.dtype), 0)
     small, rounding = np.zeros((2, values.size), np.float32)
     near = np.abs(np.asarray(values)) <= float(indistinct(pencil, values.dtype)) / UNCERTAIN
     where = np.flatnonzero(near & (np.arange(values.size) >= pencil.n_null))
@@ -136,7 +136,7 @@ def _near_zero(
     return jax.device_put((small, rounding))
 
 
-@numpy_where_known(most=3 << 18, static_argnames=("n_null", "tolerance", "known", "stored"))
+@numpy_where_known(most=3 << 18, static_argnames=("n_null", "tolerance", "null_space_known", "stored"))
 def _quality(
     xp: Any,
     pencil: Any,
@@ -146,7 +146,7 @@ def _quality(
     lower_bound: Any,
     n_null: int,
     tolerance: float,
-    known: bool,
+    null_space_known: bool,
     stored: bool,
 ) -> tuple[Any, ...]:
     """Return residuals, convergence flags, flags of zero eigenvalues, and the multiplet tolerance.
@@ -159,7 +159,7 @@ def _quality(
     (_, residuals, twice), k = measure(pencil, vectors, values), values.size
     size = largest_of(xp, pencil.stiffness, pencil.mass)
     rounding = 4 * xp.finfo(values.dtype).eps * size
-    if known:
+    if null_space_known:
         scale = xp.maximum(xp.abs(values), xp.abs(values[min(n_null, k - 1)]))
     else:
         last = xp.where(xp.isfinite(following), following, values[-1])
@@ -168,6 +168,6 @@ def _quality(
         scale = xp.where(scale > 100 * rounding, scale, size)
     scale = xp.where(scale > 0, scale, xp.where(size > 0, size, 1)).astype(values.dtype)
     converged = (residuals <= allowed_residuals(scale, rounding, tolerance, xp, stored)) & ~twice
-    converged = converged & (values >= 0) if known else converged
+    converged = converged & (values >= 0) if null_space_known else converged
     tolerance = xp.clip(rounding / scale[-1], 1e-6, 1e-3).astype(values.dtype)
     return residuals / scale, converged, xp.abs(values) <= rounding, tolerance

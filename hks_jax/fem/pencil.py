@@ -213,7 +213,7 @@ def assembled(
 ) -> Pencil:
     """Return the pencil of K and M and its known properties; ``lumped`` has the row sums of M at all nodes."""
     mass = DiagonalOperator(entries=space.restrict(lumped)) if operator.lumped else consistent
-    if operator.own:
+    if operator.custom:
         return Pencil(stiffness, mass, None, None, space)
     nulls = bound = None
     if "potential" in fields:
@@ -222,8 +222,8 @@ def assembled(
         nulls = _constants(space, lumped)
     sums = space.restrict(lumped) if operator.cancelling else None
     weighted = jnp.sum(lumped) if operator.fick or "density" in fields else None
-    known: dict[str, Any] = {"null_space": nulls, "lower_bound": bound, "row_sums": sums, "density": density}
-    return Pencil(stiffness, mass, metric, volume, space, **known, weighted_volume=weighted)
+    properties: dict[str, Any] = {"null_space": nulls, "lower_bound": bound, "row_sums": sums, "density": density}
+    return Pencil(stiffness, mass, metric, volume, space, **properties, weighted_volume=weighted)
 
 
 # With a potential V and a density ρ, the stiffness is K = A + ∫ρV hᵢhⱼ, where A ⪰ 0. If the potential is at least v at

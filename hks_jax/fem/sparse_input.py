@@ -122,8 +122,8 @@ def pencil_of(domain: Any, boundary: BoundarySpec, mass: MassKind, quadrature: Q
 
 def _require_definite_mass(pencil: Pencil) -> None:
     """Raise ValueError if the user's own M, in a matrix or a form, is concrete and not positive definite."""
-    own = isinstance(pencil.space, MatrixSpace) or pencil.volume is None
-    if not own or isinstance(pencil.mass, DiagonalOperator) or is_traced(pencil):
+    custom = isinstance(pencil.space, MatrixSpace) or pencil.volume is None
+    if not custom or isinstance(pencil.mass, DiagonalOperator) or is_traced(pencil):
         return
     negative, sound = inertia_on_host(pencil.mass.to_scipy().tocsc(), identity(pencil.size, format="csc"), 0.0)
     if negative or not sound:
