@@ -42,13 +42,14 @@ def pairs_of_pencil(
     solver = _able(solver, boxed, k, extra)
     boxed = _with_balance(boxed) if single_on_host else boxed
     values, frame, following, bound, spare = solved(solver, boxed, k, extra, throw, report, rows)
-    values, quality = _judged(boxed, solver, values, frame, following, single_on_host)
     # While differentiating, JAX may turn a constant array into a Python number.
+    following, bound = jax_array(following), jax_array(bound)
+    values, quality = _judged(boxed, solver, values, frame, following, single_on_host)
     return PencilEigenpairs(
         eigenvalues=values,
         kept=jax_array(np.ones(k, bool)),
-        next_eigenvalue=jax_array(following),
-        complete_below=jax_array(bound),
+        next_eigenvalue=following,
+        complete_below=bound,
         frame=boxed.space.transfer(frame, inner.space),
         pencil=pencil,
         solver_name=solver.name,

@@ -100,8 +100,8 @@ def sparse_pencil(
 
 def pencil_of(domain: Any, boundary: BoundarySpec, mass: MassKind, quadrature: Quadrature = "gauss") -> AnyPencil:
     """Return the pencil of a field, a mesh, a matrix K or a pair (K, M); a given pencil is checked and returned."""
-    matrices = BCOO | BCSR | Operator | np.ndarray | jax.Array | list | LinearOperator
-    matrix = issparse(domain) or isinstance(domain, matrices)
+    kinds = BCOO | BCSR | Operator | np.ndarray | jax.Array | list | LinearOperator
+    matrix = issparse(domain) or isinstance(domain, kinds)
     if not matrix and not isinstance(domain, SymmetricPencil | MirrorPencil | tuple):
         return assemble(domain, boundary, mass, quadrature=quadrature)
     if (boundary, mass, quadrature) != ("neumann", "consistent", "gauss"):
