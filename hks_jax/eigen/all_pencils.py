@@ -6,9 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from hks_jax.arrays import jax_array
 from hks_jax.eigen.automatic import choose_solvers
@@ -17,15 +15,7 @@ from hks_jax.eigen.eigenpairs import Eigenpairs, PencilEigenpairs, require_pairs
 from hks_jax.eigen.one_pencil import pairs_of_pencil
 from hks_jax.eigen.solver import Dense, Eigensolver, Report, Status
 from hks_jax.fem.pencil import AnyPencil, Pencil
-from hks_jax.fem.space import FunctionSpace
 from hks_jax.traced import is_traced
-
-
-class _Start(NamedTuple):
-    """What a problem starts from: the number of pairs that a similar one needed, and all vectors of its iteration."""
-
-    k: int = 0
-    vectors: Float[Array, "m n_dof"] | None = None
 
 
 class _Problem(NamedTuple):
@@ -34,7 +24,7 @@ class _Problem(NamedTuple):
     pencil: Pencil
     solvers: tuple[Eigensolver, ...]
     limit: int  # the largest possible number of its pairs among the k lowest pairs of all problems
-    start: _Start
+    start: PencilEigenpairs | None  # the pairs of a similar problem, to start from
 
 
 def pairs_of_pencils(
@@ -55,7 +45,7 @@ def pairs_of_pencils(
     solvers = _solvers(solver, pencil, k, limits)
     problems = [_Problem(*each) for each in zip(pencil.parts, solvers, limits, starts, strict=True)]
     share = k if is_traced(jax.lax.stop_gradient(pencil)) else _share(pencil, k)
-    wanted = [min(each.limit, max(share, each.start.k)) for each in problems]
+    wanted = [min(each.limit, max(share, 0 if each.start is None else each.start.k)) for each in problems]
     pairs: dict[int, PencilEigenpairs] = {}
     while any(wanted):
         for i, each in enumerate(problems):
@@ -73,22 +63,15 @@ def _limits(pencil: AnyPencil, k: int) -> list[int]:
     return [min(max(k // len(including), 1), part.size) for including, part in shares]
 
 
-def _starts(start: Eigenpairs | None, pencil: AnyPencil) -> list[_Start]:
-    """Return the start of each problem, from the pairs of similar problems."""
+def _starts(start: Eigenpairs | None, pencil: AnyPencil) -> Sequence[PencilEigenpairs | None]:
+    """Return the pairs from which each problem starts, as constants."""
     if start is None:
-        return [_Start()] * len(pencil.parts)
+        return [None] * len(pencil.parts)
     problems = jax.lax.stop_gradient(require_pairs(start).problems)
     expected, got = ([each.space.node_shape for each in of] for of in (pencil.parts, problems))
     if got != expected:
         raise ValueError(f"start: got pairs on nodes of the shapes {got}; expected {expected}, one for each problem")
-    return [_Start(each.k, _all_vectors(each, part.space)) for each, part in zip(problems, pencil.parts, strict=True)]
-
-
-def _all_vectors(pairs: PencilEigenpairs, space: FunctionSpace) -> Float[Array, "m n_dof"] | None:
-    """Return all vectors of the iteration that found the pairs, in a given space; None if they were not kept."""
-    if pairs.spare is None:
-        return None
-    return pairs.space.transfer(jnp.concatenate([pairs.frame, pairs.spare]), space)
+    return problems
 
 
 def _solvers(
@@ -123,7 +106,7 @@ def _share(pencil: AnyPencil, k: int) -> int:
 def _solved(problem: _Problem, k: int, throw: bool, report: Report) -> PencilEigenpairs:
     """Return the k lowest pairs of a problem, by its first solver whose result leaves no doubt, or by the last one."""
     for solver in problem.solvers:
-        pairs = pairs_of_pencil(problem.pencil, solver, k, throw, report, problem.start.vectors)
+        pairs = pairs_of_pencil(problem.pencil, solver, k, throw, report, problem.start)
         if solver is problem.solvers[-1] or not _is_doubtful(pairs):
             break
     return pairs

@@ -27,16 +27,19 @@ def pairs_of_pencil(
     k: int,
     throw: bool,
     report: Report,
-    start: Float[Array, "m n_dof"] | None = None,
+    start: PencilEigenpairs | None = None,
 ) -> PencilEigenpairs:
-    """Return the k lowest pairs; see `solved` for ``throw``, and `Eigensolver.starts` for ``start``."""
+    """Return the k lowest pairs, from those of a similar pencil (``start``). See `solved` for ``throw``."""
     extra = min(1, pencil.size - k)  # the next eigenvalue shows whether k cuts a multiple eigenvalue
     solver.require(pencil)
     inner = boxed = pencil
     if not isinstance(solver, Dense):
         inner = cropped(pencil)  # with the same unknowns
         boxed = in_box(inner, k + extra)
-    rows = None if start is None else inner.space.transfer(start, boxed.space)
+    rows = None
+    if start is not None and start.spare is not None:
+        rows = start.space.transfer(jnp.concatenate([start.frame, start.spare]), pencil.space)
+        rows = inner.space.transfer(rows, boxed.space)
     # Where NumPy computes in float64, it finds null vectors and eigenvalues near zero that rounding to float32 hides.
     single_on_host = boxed.stiffness.dtype == np.float32 and is_concrete_on_cpu(jax.lax.stop_gradient((boxed, rows)))
     solver = _able(solver, boxed, k, extra)
