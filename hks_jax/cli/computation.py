@@ -244,7 +244,7 @@ def solver_of(
     the tolerance of the command line and, for similar domains, keeps what later computations start from.
     """
     if settings.solver != "auto" or followers == "other":
-        solver = choose_solvers(settings.solver, pencil, k)[0]
+        solver = choose_solvers(settings.solver, pencil, k)[0][0]
     else:
         solver = (choose_for_one if followers == "none" else choose_for_similar)(pencil, k)
     if isinstance(solver, hj.ChebyshevFilter):
@@ -274,7 +274,7 @@ def compute_pairs(
     k = default_k(dimension, unknowns) if settings.k is None else settings.k
     _tell_of_resolution(k, pencil, domain, settings, progress)
     solver = solver_of(settings, pencil, k, followers)
-    with progress.stage("eigenpairs", f"{k} of {unknowns} by {choose_solvers(solver, pencil, k)[0].name}"):
+    with progress.stage("eigenpairs", f"{k} of {unknowns} by {choose_solvers(solver, pencil, k)[0][0].name}"):
         pairs = hj.eigenpairs(pencil, k, solver=solver, progress=progress.update)
         jax.block_until_ready(pairs.eigenvalues)
     if not np.asarray(pairs.converged).all():

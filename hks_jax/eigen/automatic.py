@@ -53,10 +53,19 @@ def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensol
     return SOLVERS[solver]()
 
 
-def choose_solvers(solver: str | Eigensolver, pencil: AnyPencil, k: int) -> list[Eigensolver]:
-    """Return the solver of each problem; the problems of a doubled domain share the k eigenpairs."""
+def choose_solvers(solver: str | Eigensolver, pencil: AnyPencil, k: int) -> list[tuple[Eigensolver, ...]]:
+    """Return the solver of each problem, and the one that is tried next if the first leaves doubt.
+
+    The problems of a doubled domain share the k eigenpairs.
+    """
     share = -(-k // len(pencil.parts))
-    return [choose_solver(solver, part, share) for part in pencil.parts]
+    solvers: list[tuple[Eigensolver, ...]] = []
+    for part in pencil.parts:
+        first = choose_solver(solver, part, share)
+        # Without a lower bound of the spectrum, shift-invert may fail, for example if k cuts a large multiplet.
+        unsafe = solver == "auto" and isinstance(first, ShiftInvert) and not part.bounded
+        solvers.append((first, BlockLanczos()) if unsafe else (first,))
+    return solvers
 
 
 def choose_for_similar(pencil: AnyPencil, k: int) -> Eigensolver:

@@ -45,8 +45,9 @@ def solved(
     bound as constants. Derivatives whose linear solves do not converge are NaN, and raise an error if ``throw`` is set,
     or else cause a warning if values are concrete.
     """
-    values, vectors, complete_below = _computed(solver, pencil, k + extra, report, start)
-    return *_cut(values, vectors, k), complete_below, vectors[k:] if len(vectors) > k + extra else None
+    values, vectors, complete_below = one_by_one(_lowest, (solver, k + extra, report), pencil, start)
+    *found, spare = _cut(values, vectors, k)
+    return *found, complete_below, spare
 
 
 # Let fᵢ = (dK − λᵢ dM) φᵢ, called the force. From Kφᵢ = λᵢMφᵢ and φᵢᵀMφⱼ = δᵢⱼ it follows that
@@ -67,11 +68,10 @@ def _solved_jvp(
 ) -> tuple[tuple, tuple]:
     pencil, start, change = first_order_only(primals[0]), primals[1], changes[0]
     n_dof, adjoint = pencil.size, solver.adjoint
-    spare = max(extra, min(solver.guards(k, n_dof), solver.max_pairs(n_dof) - k))
-    values, vectors, complete_below = _computed(solver, pencil, k + spare, report, start)
-    kept = vectors[k:] if len(vectors) > k + spare else None
-    vectors = vectors if kept is None else vectors[: k + spare]
-    eigenvalues, functions, following = _cut(values, vectors, k)
+    guards = max(extra, min(solver.guards(k, n_dof), solver.max_pairs(n_dof) - k))
+    values, vectors, complete_below = one_by_one(_lowest, (solver, k + guards, report), pencil, start)
+    eigenvalues, functions, following, spare = _cut(values, vectors, k)
+    vectors = vectors if spare is None else vectors[: len(values)]
     origin, solves = jnp.zeros((), values.dtype), _solves(pencil, k, len(values))
     if solves and pencil.null_space is None:  # linear solves need K ⪰ 0
         origin = _below(values, indistinct(pencil, values.dtype))
@@ -81,13 +81,13 @@ def _solved_jvp(
     # Metric and density are removed: derivatives do not need them, and reverse mode would store their arrays.
     pencil = replace(pencil, metric=None, density=None)
     on_failure: OnFailure = "error" if throw else "nothing" if is_traced(primals) else "warning"
-    known, settings = _Known(prepared, pencil, origin, values, vectors, functions), (adjoint, on_failure)
-    tangents = linear_program(_tangents, settings, (known,), change, (eigenvalues, functions), _by_numpy)
-    constants = following if extra else jnp.full_like(following, jnp.inf), complete_below, kept
-    return (eigenvalues, functions, *constants), (*tangents, *jax.tree.map(jnp.zeros_like, constants))
+    constants, settings = _Constants(prepared, pencil, origin, values, vectors, functions), (adjoint, on_failure)
+    tangents = linear_program(_tangents, settings, (constants,), change, (eigenvalues, functions), _by_numpy)
+    others = following if extra else jnp.full_like(following, jnp.inf), complete_below, spare
+    return (eigenvalues, functions, *others), (*tangents, *jax.tree.map(jnp.zeros_like, others))
 
 
-class _Known(NamedTuple):
+class _Constants(NamedTuple):
     """The constants of the derivative: the matrices K − σM and M, their first p eigenpairs, and k of the vectors."""
 
     prepared: Any  # the result of `Adjoint.prepare`
@@ -98,16 +98,21 @@ class _Known(NamedTuple):
     functions: Rows  # the first k vectors, because slicing ``vectors`` would copy the slice
 
 
-def _computed(solver: Eigensolver, pencil: Pencil, k: int, report: Report, start: Array | None) -> RawPairs:
-    values, vectors, bound = one_by_one(_by_solver, (solver, k, report), pencil, start)
+# `one_by_one` needs the same function object in every call; so `_lowest` and `_prepare` are at module level.
+def _lowest(solver: Eigensolver, k: int, report: Report, pencil: SymmetricPencil, start: Array | None) -> RawPairs:
+    """Return the solver's pairs with the exact null vectors of the pencil."""
+    lowest: Any = solver.lowest
+    values, vectors, bound = lowest(pencil, k, report, start) if solver.starts else lowest(pencil, k, report)
     if pencil.null_space is not None and pencil.n_null:
         values, vectors = _with_null_modes(pencil.mass, pencil.null_space.vectors, values, vectors)
     return values, vectors, bound
 
 
 @numpy_where_known(static_argnums=2)
-def _cut(xp: Any, values: Any, vectors: Any, k: int) -> tuple[Any, Any, Any]:
-    return values[:k], vectors[:k], values[k] if len(values) > k else xp.asarray(xp.inf, values.dtype)
+def _cut(xp: Any, values: Any, vectors: Any, k: int) -> tuple[Any, Any, Any, Any]:
+    """Return k pairs, the next eigenvalue and, if the solver returned more vectors than pairs, those after the k-th."""
+    following = values[k] if len(values) > k else xp.asarray(xp.inf, values.dtype)
+    return values[:k], vectors[:k], following, vectors[k:] if len(vectors) > len(values) else None
 
 
 @numpy_where_known()
@@ -122,9 +127,9 @@ def _solves(pencil: SymmetricPencil, k: int, p: int) -> bool:
     return p < pencil.size and pencil.n_fixed < k
 
 
-def _by_numpy(adjoint: Adjoint, on_failure: OnFailure, known: _Known) -> HostMap | None:
+def _by_numpy(adjoint: Adjoint, on_failure: OnFailure, constants: _Constants) -> HostMap | None:
     """Return `_tangents` by NumPy."""
-    prepared, pencil, origin, values, vectors, functions = known
+    prepared, pencil, origin, values, vectors, functions = constants
     if vectors.size > _ON_HOST:
         return None
     k, rows = len(functions), np.asarray(functions)
@@ -167,9 +172,11 @@ def change_of(change: SymmetricPencil, x: Rows, *p: Rows) -> SymmetricPencil:
 
 # Without the checkpoint, reverse mode would store copies of the eigenvectors.
 @partial(jax.checkpoint, static_argnums=(0, 1))
-def _tangents(adjoint: Adjoint, on_failure: OnFailure, known: _Known, change: SymmetricPencil) -> tuple[OfRows, Rows]:
+def _tangents(
+    adjoint: Adjoint, on_failure: OnFailure, constants: _Constants, change: SymmetricPencil
+) -> tuple[OfRows, Rows]:
     """Return the tangents of the first k eigenvalues, and of the frame of `solved`, for the change of K and M."""
-    prepared, pencil, origin, values, vectors, functions = known
+    prepared, pencil, origin, values, vectors, functions = constants
     k = len(functions)
     eigenvalues, guards = values[:k] + origin, vectors[k:]
     moved = change.mass.apply(functions)
@@ -183,21 +190,15 @@ def _tangents(adjoint: Adjoint, on_failure: OnFailure, known: _Known, change: Sy
     def solve(_: object, rhs: Rows) -> Rows:
         return _checked(on_failure, one_by_one(type(adjoint).solve, (adjoint,), prepared, pencil, values, vectors, rhs))
 
-    frame = with_transpose(onto_guards, onto_guards, force)
+    of_frame = with_transpose(onto_guards, onto_guards, force)
     if _solves(pencil, k, len(values)):
         # If every perturbation of K annihilates a null vector φᵢ, its force fᵢ is zero, and so is xᵢ. In reverse mode,
         # a cotangent that may be nonzero replaces fᵢ, so xᵢ is set to zero for such null vectors. JAX would
         # use products with K − λᵢM only in second derivatives, which are not supported; the identity replaces them.
         free = np.arange(k)[:, None] >= pencil.n_fixed
         rhs = jnp.where(free, -force, 0)
-        frame = frame + jnp.where(free, jax.lax.custom_linear_solve(lambda x: x, rhs, solve, symmetric=True), 0)
-    return jnp.sum(functions * force, axis=1), frame
-
-
-# `one_by_one` needs the same function object in every call; so the next two functions are at module level.
-def _by_solver(solver: Eigensolver, k: int, report: Report, pencil: SymmetricPencil, start: Array | None) -> RawPairs:
-    lowest: Any = solver.lowest
-    return lowest(pencil, k, report, start) if solver.starts else lowest(pencil, k, report)
+        of_frame = of_frame + jnp.where(free, jax.lax.custom_linear_solve(lambda x: x, rhs, solve, symmetric=True), 0)
+    return jnp.sum(functions * force, axis=1), of_frame
 
 
 def _prepare(adjoint: Adjoint, k: int, pencil: SymmetricPencil, values: Values) -> Any:

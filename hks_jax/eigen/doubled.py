@@ -1,7 +1,6 @@
 """Eigenpairs of a doubled domain: those of its even and odd problems, merged where somebody asks for them."""
 
 import math
-import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,17 +10,10 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hks_jax.arrays import jax_array
 from hks_jax.compilation import numpy_where_known
-from hks_jax.eigen.automatic import choose_solvers
 from hks_jax.eigen.eigenpairs import Eigenpairs, PencilEigenpairs, view
-from hks_jax.eigen.one_pencil import pairs_of_pencil
-from hks_jax.eigen.solver import Dense, Eigensolver, Report, Status
-from hks_jax.fem.pencil import MirrorPencil
+from hks_jax.fem.pencil import Inclusions, MirrorPencil
 from hks_jax.traced import is_traced
-
-Including = tuple[tuple[int, ...], ...]
-"""See `MirrorPencil.including`."""
 
 
 def _array(of: Callable[[Any], Array]) -> Any:
@@ -44,13 +36,11 @@ class DoubledEigenpairs(Eigenpairs, eqx.Module):
     Attributes:
         problems: the eigenpairs of each problem; `kept` marks those that are among the k lowest of the doubled domain.
         order: the places of the k lowest eigenvalues in the concatenated spectra of all problems.
-        including: the inclusions of the problems' function spaces; see `MirrorPencil`.
         k: the number of pairs.
     """
 
     problems: tuple[PencilEigenpairs, ...]
     order: Int[Array, " k"]
-    including: Including = eqx.field(static=True)
     k: int = eqx.field(static=True)
 
     eigenvalues = _merged("eigenvalues")
@@ -60,10 +50,11 @@ class DoubledEigenpairs(Eigenpairs, eqx.Module):
     kept = _merged("kept")
 
     @classmethod
-    def of(cls, problems: Sequence[PencilEigenpairs], including: Including, k: int) -> "DoubledEigenpairs":
-        """Return the k lowest pairs of all problems; see `MirrorPencil` for ``including``."""
+    def of(cls, problems: Sequence[PencilEigenpairs], k: int) -> "DoubledEigenpairs":
+        """Return the k lowest pairs of all problems."""
+        including = MirrorPencil(tuple(each.pencil for each in problems)).including
         order = _order([jax.lax.stop_gradient(each.eigenvalues) for each in problems], including, k)
-        return cls(tuple(problems), order, including, k)
+        return cls(tuple(problems), order, k)
 
     def merged(self, values: Sequence[Any]) -> Array:
         """Return the values (…, k) for each pair, given those for the pairs of each problem."""
@@ -72,8 +63,8 @@ class DoubledEigenpairs(Eigenpairs, eqx.Module):
     @property
     def _known_order(self) -> Int[Array, " k"]:
         order = self.order
-        known = None if is_traced(order) or order.dtype == jax.dtypes.float0 else np.sort(np.asarray(order), axis=-1)
-        if order.dtype == jax.dtypes.float0 or (known is not None and (np.diff(known, axis=-1) == 0).any()):
+        places = None if is_traced(order) or order.dtype == jax.dtypes.float0 else np.sort(np.asarray(order), axis=-1)
+        if order.dtype == jax.dtypes.float0 or (places is not None and (np.diff(places, axis=-1) == 0).any()):
             raise ValueError(
                 'pairs: got a derivative or difference of eigenpairs with the boundary "mean" or "mirror", which does '
                 "not know the order of the eigenvalues. Differentiate a function that returns `pairs.eigenvalues` or "
@@ -121,7 +112,7 @@ class DoubledEigenpairs(Eigenpairs, eqx.Module):
     def pencil(self) -> MirrorPencil | None:
         """The matrices of all problems."""
         pencils = tuple(each.pencil for each in self.problems)
-        return None if None in pencils else MirrorPencil(pencils, self.including)
+        return None if None in pencils else MirrorPencil(pencils)
 
     @view
     def solver_name(self) -> str:
@@ -144,7 +135,7 @@ class DoubledEigenpairs(Eigenpairs, eqx.Module):
 # their order. The problem with the smaller space could then have more of the lowest eigenvalues of the doubled domain
 # than `MirrorPencil.including` allows.
 @numpy_where_known(static_argnums=(1, 2))
-def _order(xp: Any, spectra: Any, including: Including, k: int) -> Any:
+def _order(xp: Any, spectra: Any, including: Inclusions, k: int) -> Any:
     """Return the places (…, k) of the k lowest eigenvalues in the concatenated spectra of all problems."""
     keys: list[Any] = []
     for own, others in zip(spectra, including, strict=True):
@@ -174,79 +165,3 @@ def _split(xp: Any, order: Any, kept: Any, sizes: tuple[int, ...]) -> Any:
     """Return the mask of each problem's pairs that are among the kept ones of the k lowest."""
     problem = xp.asarray(np.repeat(np.arange(len(sizes)), sizes))[order]
     return [xp.arange(size) < xp.sum(kept & (problem == i)) for i, size in enumerate(sizes)]
-
-
-def pairs_of_doubled(
-    pencil: MirrorPencil,
-    solver: str | Eigensolver,
-    k: int,
-    throw: bool,
-    report: Report,
-    starts: Sequence[PencilEigenpairs | None],
-) -> DoubledEigenpairs:
-    """Return the k lowest pairs of a doubled domain, from its problems, each solved for one more eigenvalue.
-
-    For traced values, each problem is solved for the largest number of pairs that it can have among the k lowest
-    (`_limits`). For concrete values, each problem is first solved for an equal share of the k pairs plus a margin, and
-    again for twice as many pairs while some of its pairs may be missing.
-    """
-    parts, limits = pencil.parts, _limits(pencil, k)
-    traced = is_traced(jax.lax.stop_gradient(pencil))
-    wanted = limits
-    if not traced:
-        before = [0 if start is None else start.k for start in starts]
-        wanted = [min(limit, max(_share(pencil, k), own)) for limit, own in zip(limits, before, strict=True)]
-    solvers = choose_solvers(solver, pencil, k)
-
-    def solve(number: int, report: Report) -> PencilEigenpairs:
-        part, own, limit = parts[number], solvers[number], limits[number]
-        extra = min(1, part.size - wanted[number])
-        if limit + extra > own.max_pairs(part.size):  # all pairs of a small problem may be needed
-            own = Dense(own.tolerance)
-        return pairs_of_pencil(part, own, wanted[number], extra, throw, report, starts[number])
-
-    solved = [solve(i, _of_problem(report, i, len(parts))) for i in range(len(parts))]
-    while not traced:
-        known = jax.lax.stop_gradient([(pairs.eigenvalues, pairs.next_eigenvalue) for pairs in solved])
-        merged = np.sort(np.concatenate([np.append(*each) for each in known]))
-        reach = merged[k] if merged.size > k else np.inf
-        short = [i for i, (_, end) in enumerate(known) if wanted[i] < limits[i] and not end >= reach]
-        if not short:
-            break
-        for i in short:
-            wanted[i] = min(limits[i], 2 * wanted[i])
-            solved[i] = solve(i, report)
-    return DoubledEigenpairs.of(solved, pencil.including, k).keeping(jax_array(np.ones(k, bool)))
-
-
-def _limits(pencil: MirrorPencil, k: int) -> list[int]:
-    """Return, for each problem, the largest possible number of its pairs among the k lowest pairs of all problems."""
-    shares = zip(pencil.including, pencil.parts, strict=True)
-    return [min(max(k // len(including), 1), part.size) for including, part in shares]
-
-
-# By Weyl's law, a problem has N(λ) ≈ V λ^(3/2)/6π² ± S λ/16π eigenvalues below λ in 3D, and (A λ ± L √λ)/4π in 2D; S
-# or L is the measure of its boundary. The boundary terms of all problems cancel: with the share m = k/n of each of n
-# problems, the k-th eigenvalue of all is about (6π²m/V)^(2/3) or 4πm/A. There the boundary term of the even problem is
-# S V^(−2/3) (6π²m)^(2/3)/16π or L √(m/4πA): for a cube 1.8 m^(2/3), for a square 1.1 √m. The margin is 2.5 times as
-# large, for domains with a longer boundary.
-_MARGIN = {2: 2.8, 3: 4.5}
-
-
-def _share(pencil: MirrorPencil, k: int) -> int:
-    """Return a number of pairs that each problem rarely exceeds among the k lowest pairs of all problems."""
-    d, mean = pencil.space.dimension, k / len(pencil.parts)
-    return math.ceil(mean + _MARGIN[d] * mean ** (1 - 1 / d)) + 4
-
-
-def _of_problem(report: Report, number: int, of: int) -> Report:
-    """Return a report function that names the current problem, and assumes that each later problem takes as long."""
-    begin = time.perf_counter()
-
-    def tell(text: str) -> None:
-        left = getattr(text, "seconds_left", None)
-        if left is not None:
-            left += (of - 1 - number) * (time.perf_counter() - begin + left)
-        report(Status(f"problem {number + 1} of {of}: {text}", left))
-
-    return tell

@@ -1,6 +1,5 @@
 """The driver: `eigenpairs` assembles matrices, chooses a solver, and truncates the spectrum."""
 
-from collections.abc import Sequence
 from typing import Any, get_args
 
 import jax
@@ -8,18 +7,13 @@ import numpy as np
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import require_static
-from hks_jax.eigen.automatic import choose_solver
-from hks_jax.eigen.doubled import pairs_of_doubled
-from hks_jax.eigen.eigenpairs import RESULTS, Eigenpairs, PencilEigenpairs, require_pairs
-from hks_jax.eigen.lanczos.block_lanczos import BlockLanczos
+from hks_jax.eigen.all_pencils import pairs_of_pencils
+from hks_jax.eigen.eigenpairs import RESULTS, Eigenpairs
 from hks_jax.eigen.multiplets import SPARE, MultipletChoice
-from hks_jax.eigen.one_pencil import pairs_of_pencil
-from hks_jax.eigen.shift_invert.shift_invert import ShiftInvert
 from hks_jax.eigen.solver import Eigensolver, Report, silent
 from hks_jax.fem.assembly import MassKind
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.elements import Quadrature
-from hks_jax.fem.pencil import AnyPencil, MirrorPencil
 from hks_jax.fem.sparse_input import pencil_of
 from hks_jax.traced import is_traced
 
@@ -98,14 +92,16 @@ def eigenpairs(
             f"k: got {k}; expected an integer from 1 to {total}, the number of degrees of freedom. "
             "Use a smaller k or a finer grid"
         )
-    pairs = _pairs_of(pencil, int(number), total, solver, multiplet, throw, progress or silent, _starts(start, pencil))
-    known = jax.lax.stop_gradient(pairs)
-    if is_traced(known.eigenvalues):
-        return known.result.error_if(pairs, known.result != RESULTS.successful) if throw else pairs
-    if throw and known.result != RESULTS.successful:
+    k = int(number)
+    size = min(k + SPARE, total) if multiplet == "complete" else k
+    pairs = pairs_of_pencils(pencil, solver, size, throw, progress or silent, start).truncated(k, multiplet)
+    found = jax.lax.stop_gradient(pairs)
+    if is_traced(found.eigenvalues):
+        return found.result.error_if(pairs, found.result != RESULTS.successful) if throw else pairs
+    if throw and found.result != RESULTS.successful:
         codes: Any = RESULTS  # mypy sees its members as strings
-        raise RuntimeError(codes[known.result])
-    for message in known.messages():
+        raise RuntimeError(codes[found.result])
+    for message in found.messages():
         warn_of_accuracy(message)
     return pairs
 
@@ -158,39 +154,3 @@ def eigsh(
         [0.268 1. 2. ]
     """
     return eigenpairs(K if M is None else (K, M), k, solver=solver or "auto", throw=throw, progress=progress)
-
-
-def _starts(start: Eigenpairs | None, pencil: AnyPencil) -> Sequence[PencilEigenpairs | None]:
-    """Return the pairs from which each problem starts."""
-    if start is None:
-        return [None] * len(pencil.parts)
-    problems = jax.lax.stop_gradient(require_pairs(start).problems)
-    own, known = ([each.space.node_shape for each in of] for of in (pencil.parts, problems))
-    if own != known:
-        raise ValueError(f"start: got pairs on nodes of the shapes {known}; expected {own}, one for each problem")
-    return problems
-
-
-def _pairs_of(
-    pencil: AnyPencil,
-    k: int,
-    total: int,
-    solver: str | Eigensolver,
-    multiplet: MultipletChoice,
-    throw: bool,
-    report: Report,
-    starts: Sequence[PencilEigenpairs | None],
-) -> Eigenpairs:
-    size = min(k + SPARE, total) if multiplet == "complete" else k
-    pairs: Eigenpairs
-    if isinstance(pencil, MirrorPencil):
-        pairs = pairs_of_doubled(pencil, solver, size, throw, report, starts)
-    else:
-        chosen = choose_solver(solver, pencil, size)
-        extra = min(1, total - size)  # the next eigenvalue shows whether k cuts a multiple eigenvalue
-        pairs = pairs_of_pencil(pencil, chosen, size, extra, throw, report, *starts)
-        found = jax.lax.stop_gradient(pairs)
-        doubtful = solver == "auto" and isinstance(chosen, ShiftInvert) and not pencil.bounded
-        if doubtful and (found.unconfirmed or not found.converged.all()):  # for example, if k cuts a large multiplet
-            pairs = pairs_of_pencil(pencil, BlockLanczos(), size, extra, throw, report)
-    return pairs.truncated(k, multiplet)

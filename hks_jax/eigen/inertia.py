@@ -155,8 +155,8 @@ def locate(pencil: SymmetricPencil, wanted: int, probes: int) -> tuple[Scalar, S
     # Outside `jit`, the search for the origin calls the same compiled factorisation as spectrum slicing, which follows.
     start = _Search(-infinite, infinite, none, infinite, -least, none, none, jnp.ones((), bool))
     state = while_loop(lambda state: state.going & (state.tries < _TRIES), step, start)
-    known = jnp.isfinite(state.low) & jnp.isfinite(state.high)
-    low, first = (jnp.where(known, end, jnp.nan) for end in (state.low, state.first))
+    found = jnp.isfinite(state.low) & jnp.isfinite(state.high)
+    low, first = (jnp.where(found, end, jnp.nan) for end in (state.low, state.first))
     return low, first, state.number
 
 

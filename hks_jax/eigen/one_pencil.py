@@ -14,7 +14,7 @@ from hks_jax.eigen.derivative import solved
 from hks_jax.eigen.eigenpairs import UNCERTAIN, PencilEigenpairs
 from hks_jax.eigen.quality import allowed_residuals, indistinct, largest, largest_of, measure_pairs, measured_on_host
 from hks_jax.eigen.solver import Dense, Eigensolver, Report
-from hks_jax.fem.box import from_box, in_box, to_box
+from hks_jax.fem.box import cropped, in_box
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import MatrixSpace
 from hks_jax.linear.host_matrices import balanced, near_zero
@@ -25,78 +25,88 @@ def pairs_of_pencil(
     pencil: Pencil,
     solver: Eigensolver,
     k: int,
-    extra: int,
     throw: bool,
     report: Report,
     start: PencilEigenpairs | None = None,
 ) -> PencilEigenpairs:
-    """Return the k lowest pairs and, if ``extra`` = 1, the next eigenvalue. See `solved` for ``throw``."""
-    given, pencil = pencil, pencil if isinstance(solver, Dense) else in_box(pencil, k + extra)
+    """Return the k lowest pairs, from those of a similar pencil (``start``). See `solved` for ``throw``."""
+    extra = min(1, pencil.size - k)  # the next eigenvalue shows whether k cuts a multiple eigenvalue
     solver.require(pencil)
-    pencil, n_dof, most = _with_balance(pencil), pencil.size, solver.max_pairs(pencil.size)
-    if k + extra > most and pencil.null_space is None:
-        solver = Dense(solver.tolerance)
-    elif k + extra > most:
-        if most < 2:
-            raise ValueError(
-                f"solver: got {solver.name!r} for {n_dof} unknowns, which are too few for it. Use the dense solver"
-            )
-        raise ValueError(
-            f"k: got {k}, for which {k + extra} pairs are needed (one more shows where the spectrum is cut); the "
-            f"{solver.name} solver computes at most {most} of {n_dof} pairs. Use a smaller k or the dense solver"
-        )
+    inner = boxed = pencil
+    if not isinstance(solver, Dense):
+        inner = cropped(pencil)  # with the same unknowns
+        boxed = in_box(inner, k + extra)
     rows = None
     if start is not None and start.spare is not None:
-        rows = start.space.transfer(jnp.concatenate([start.frame, start.spare]), given.space)
-        rows = to_box(rows, given.space, pencil.space)
-    pairs = _pairs(pencil, solved(solver, pencil, k, extra, throw, report, rows), solver)
-    frame = from_box(pairs.frame, pencil.space, given.space)
-    spare = None if pairs.spare is None else from_box(pairs.spare, pencil.space, given.space)
-    return replace(pairs, frame=frame, spare=spare, pencil=given)
+        rows = start.space.transfer(jnp.concatenate([start.frame, start.spare]), pencil.space)
+        rows = inner.space.transfer(rows, boxed.space)
+    # Where NumPy computes in float64, it finds null vectors and eigenvalues near zero that rounding to float32 hides.
+    single_on_host = boxed.stiffness.dtype == np.float32 and is_concrete_on_cpu(jax.lax.stop_gradient((boxed, rows)))
+    solver = _able(solver, boxed, k, extra)
+    boxed = _with_balance(boxed) if single_on_host else boxed
+    values, frame, following, bound, spare = solved(solver, boxed, k, extra, throw, report, rows)
+    # While differentiating, JAX may turn a constant array into a Python number.
+    following, bound = jax_array(following), jax_array(bound)
+    values, quality = _judged(boxed, solver, values, frame, following, single_on_host)
+    return PencilEigenpairs(
+        eigenvalues=values,
+        kept=jax_array(np.ones(k, bool)),
+        next_eigenvalue=following,
+        complete_below=bound,
+        frame=boxed.space.transfer(frame, inner.space),
+        pencil=pencil,
+        solver_name=solver.name,
+        spare=None if spare is None else boxed.space.transfer(spare, inner.space),
+        **quality,
+    )
+
+
+def _able(solver: Eigensolver, pencil: Pencil, k: int, extra: int) -> Eigensolver:
+    """Return the solver or, if it cannot compute so many pairs of a K that may be indefinite, the dense one."""
+    n_dof, most = pencil.size, solver.max_pairs(pencil.size)
+    if k + extra <= most:
+        return solver
+    if pencil.null_space is None:
+        return Dense(solver.tolerance)
+    if most < 2:
+        raise ValueError(
+            f"solver: got {solver.name!r} for {n_dof} unknowns, which are too few for it. Use the dense solver"
+        )
+    raise ValueError(
+        f"k: got {k}, for which {k + extra} pairs are needed (one more shows where the spectrum is cut); the "
+        f"{solver.name} solver computes at most {most} of {n_dof} pairs. Use a smaller k or the dense solver"
+    )
 
 
 def _with_balance(pencil: Pencil) -> Pencil:
-    """Return a float32 pencil of the user's own K with the null vectors of K that rounding hides; see `balanced`."""
-    known, own = jax.lax.stop_gradient(pencil), isinstance(pencil.space, MatrixSpace) or pencil.volume is None
-    if pencil.null_space is not None or not own or not _single_on_host(known.stiffness, known.stiffness):
+    """Return the pencil of the user's own K with the null vectors that rounding to float32 hides; see `balanced`."""
+    custom = isinstance(pencil.space, MatrixSpace) or pencil.volume is None
+    if pencil.null_space is not None or not custom:
         return pencil
-    source = replace(known.unrounded, null_vectors=balanced(known))
-    return replace(pencil, source=source)
+    constant = jax.lax.stop_gradient(pencil)
+    return replace(pencil, source=replace(constant.unrounded, null_vectors=balanced(constant)))
 
 
-def _single_on_host(values: Any, args: Any) -> bool:
-    return values.dtype == np.float32 and is_concrete_on_cpu(args)
-
-
-def _pairs(pencil: Pencil, found: tuple[Any, ...], solver: Eigensolver) -> PencilEigenpairs:
-    """Return the `PencilEigenpairs` of a pencil, given the result of `solved`."""
-    values, frame, following, bound, spare = found
-    known, double = pencil.null_space is not None, solver.in_double
-    constants = jax.lax.stop_gradient((pencil, frame, values, following))
+def _judged(
+    pencil: Pencil, solver: Eigensolver, values: Array, vectors: Array, following: Array, single_on_host: bool
+) -> tuple[Array, dict[str, Array]]:
+    """Return the eigenvalues, where those near zero may be more accurate, and the indicators of the pairs' quality."""
+    null_space_known = pencil.null_space is not None
+    constants = jax.lax.stop_gradient((pencil, vectors, values, following))
     matrices = tabulated(SymmetricPencil(constants[0].stiffness, constants[0].mass))
-    stored = double and _single_on_host(values, constants)
-    settings = pencil.n_null, solver.tolerance, known, stored
-    quality = _quality(matrices, *constants[1:], constants[0].lower_bound, *settings)
-    residuals, converged, zero, tolerance = quality
-    small, rounding = _near_zero(*constants[:3], zero, double)
-    if not known:
+    settings = pencil.n_null, solver.tolerance, null_space_known, solver.in_double and single_on_host
+    residuals, converged, zero, tolerance = _quality(matrices, *constants[1:], constants[0].lower_bound, *settings)
+    small, rounding = _near_zero(*constants[:3], zero, solver.in_double, single_on_host)
+    if not null_space_known:
         values = _with_small(values, constants[2], zero, small)
-    # While differentiating, JAX may turn a constant array into a Python number.
-    return PencilEigenpairs(
-        eigenvalues=values,
-        residuals=residuals,
-        converged=converged,
-        rounding=rounding,
-        kept=jax_array(np.ones(values.size, bool)),
-        next_eigenvalue=jax_array(following),
-        complete_below=jax_array(bound),
-        spectral_origin=jnp.zeros((), values.dtype) if known else jax.lax.stop_gradient(values[0]),
-        multiplet_tolerance=tolerance,
-        frame=frame,
-        pencil=pencil,
-        solver_name=solver.name,
-        spare=spare,
-    )
+    origin = jnp.zeros((), values.dtype) if null_space_known else jax.lax.stop_gradient(values[0])
+    return values, {
+        "residuals": residuals,
+        "converged": converged,
+        "rounding": rounding,
+        "multiplet_tolerance": tolerance,
+        "spectral_origin": origin,
+    }
 
 
 @numpy_where_known()
@@ -106,18 +116,18 @@ def _with_small(xp: Any, values: Any, constant: Any, zero: Any, small: Any) -> A
 
 
 def _near_zero(
-    pencil: Pencil, vectors: Array, values: Array, zero: Array, accurate: bool
+    pencil: Pencil, vectors: Array, values: Array, zero: Array, accurate: bool, single_on_host: bool
 ) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
     """Return the eigenvalues that are zero within rounding, with 0 for the others, and `Eigenpairs.rounding`.
 
     In float32, eigenvalues that are zero within rounding may be accurate in float64, in which the host computes.
     ``accurate`` states whether the solver computed in float64.
     """
-    nothing, known = jax_array(np.zeros(values.shape, values.dtype)), pencil.null_space is not None
+    nothing, null_space_known = jax_array(np.zeros(values.shape, values.dtype)), pencil.null_space is not None
     if values.dtype != np.float32:
         return nothing, nothing
-    if not _single_on_host(values, (pencil, vectors, values)):
-        return nothing, nothing if known else jnp.where(zero, indistinct(pencil, values.dtype), 0)
+    if not single_on_host:
+        return nothing, nothing if null_space_known else jnp.where(zero, indistinct(pencil, values.dtype), 0)
     small, rounding = np.zeros((2, values.size), np.float32)
     near = np.abs(np.asarray(values)) <= float(indistinct(pencil, values.dtype)) / UNCERTAIN
     where = np.flatnonzero(near & (np.arange(values.size) >= pencil.n_null))
@@ -130,7 +140,7 @@ def _near_zero(
     return jax.device_put((small, rounding))
 
 
-@numpy_where_known(most=3 << 18, static_argnames=("n_null", "tolerance", "known", "stored"))
+@numpy_where_known(most=3 << 18, static_argnames=("n_null", "tolerance", "null_space_known", "stored"))
 def _quality(
     xp: Any,
     pencil: Any,
@@ -140,7 +150,7 @@ def _quality(
     lower_bound: Any,
     n_null: int,
     tolerance: float,
-    known: bool,
+    null_space_known: bool,
     stored: bool,
 ) -> tuple[Any, ...]:
     """Return residuals, convergence flags, flags of zero eigenvalues, and the multiplet tolerance.
@@ -153,7 +163,7 @@ def _quality(
     (_, residuals, twice), k = measure(pencil, vectors, values), values.size
     size = largest_of(xp, pencil.stiffness, pencil.mass)
     rounding = 4 * xp.finfo(values.dtype).eps * size
-    if known:
+    if null_space_known:
         scale = xp.maximum(xp.abs(values), xp.abs(values[min(n_null, k - 1)]))
     else:
         last = xp.where(xp.isfinite(following), following, values[-1])
@@ -162,6 +172,6 @@ def _quality(
         scale = xp.where(scale > 100 * rounding, scale, size)
     scale = xp.where(scale > 0, scale, xp.where(size > 0, size, 1)).astype(values.dtype)
     converged = (residuals <= allowed_residuals(scale, rounding, tolerance, xp, stored)) & ~twice
-    converged = converged & (values >= 0) if known else converged
+    converged = converged & (values >= 0) if null_space_known else converged
     tolerance = xp.clip(rounding / scale[-1], 1e-6, 1e-3).astype(values.dtype)
     return residuals / scale, converged, xp.abs(values) <= rounding, tolerance

@@ -38,8 +38,8 @@ def with_rotations(frame: Rows, values: Values, pencil: Pencil) -> Rows:
 @with_rotations.defjvp
 def _with_rotations_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     frame, values, pencil = first_order_only(primals)
-    known = frame, values, indistinct(pencil, values.dtype)
-    return frame, tangents[0] + linear_program(_rotations, (), known, tangents[2], frame)
+    constants = frame, values, indistinct(pencil, values.dtype)
+    return frame, tangents[0] + linear_program(_rotations, (), constants, tangents[2], frame)
 
 
 @jax.checkpoint

@@ -16,7 +16,7 @@ from hks_jax.fem.fields import checked_field
 from hks_jax.fem.forms import Form, WeakForm, l2, laplace_beltrami
 from hks_jax.fem.integrals import assemble_grid, assemble_mesh, grid_points, mesh_nodes, mesh_points
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
-from hks_jax.fem.problems import inclusions, problems_of
+from hks_jax.fem.problems import problems_of
 from hks_jax.linear.operators import PatternedOperator, require_symmetric
 from hks_jax.traced import is_traced
 
@@ -164,7 +164,7 @@ def assemble_forms(
         raise ValueError("stiffness: got none with components > 1; expected a form for vector-valued functions")
     if not isinstance(fields, Mapping | None):
         raise ValueError(f"fields: got {describe_array(fields)}; expected a dictionary {{name: array}}")
-    operator = WeakForm(stiffness, mass if callable(mass) else l2, mass == "lumped", components, own=True)
+    operator = WeakForm(stiffness, mass if callable(mass) else l2, mass == "lumped", components, custom=True)
     return _assembled(domain, boundary, operator, dict(fields or {}), degree, midpoints)
 
 
@@ -205,17 +205,17 @@ def _assembled(
         nodes, dtype = None, domain.tensors.dtype
         points, pencil_on = partial(grid_points, domain.grid, dtype=dtype), partial(assemble_grid, domain)
     spaces = problems_of(domain, boundary, degree)
-    known, held = not operator.own, {}
+    built_in, held = not operator.custom, {}
     for name, value in given.items():
-        settings = {"scalar": known, "positive": known and name == "density"}
+        settings = {"scalar": built_in, "positive": built_in and name == "density"}
         held[name] = checked_field(name, value, spaces[0], partial(points, spaces[0]), dtype, **settings)
-    operator = operator._replace(checked=known or not is_traced((domain, held, nodes)))
+    operator = operator._replace(checked=built_in or not is_traced((domain, held, nodes)))
     pencils = [pencil_on(held, each, operator) for each in spaces]
     if midpoints is not None and not is_traced(pencils) and np.isnan(pencils[0].mass.diagonal()).any():
         raise ValueError("midpoints: got positions that fold or invert cells; move them closer to the straight edges")
-    if operator.own and operator.checked:
+    if operator.custom and operator.checked:
         for name in ("stiffness", "mass"):
             matrix = getattr(pencils[0], name)
             if isinstance(matrix, PatternedOperator):
                 require_symmetric(name, *matrix.triplets(), matrix.size, "Make the form symmetric in u and v")
-    return pencils[0] if len(pencils) == 1 else MirrorPencil(tuple(pencils), inclusions(spaces))
+    return pencils[0] if len(pencils) == 1 else MirrorPencil(tuple(pencils))

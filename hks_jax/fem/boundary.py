@@ -60,9 +60,9 @@ def _pair(entry: str | Sides) -> Sides:
     low, high = pair
     unknown = [name for name in pair if name not in _CONDITIONS]
     if unknown:
-        known = ", ".join(map(repr, _CONDITIONS))
+        possible = ", ".join(map(repr, _CONDITIONS))
         alone = ', or "dirichlet-rim" alone, which is for all sides and the rim of a mask'
-        raise ValueError(f"boundary: got {unknown[0]!r}; expected one of {known}{alone}")
+        raise ValueError(f"boundary: got {unknown[0]!r}; expected one of {possible}{alone}")
     if low != high and not {low, high} <= set(_SIDE_BY_SIDE):
         raise ValueError(f'boundary: got {entry!r} for one axis; "periodic" and "mirror" must be on both sides')
     return low, high

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.fem.pencil import Pencil
-from hks_jax.fem.space import FunctionSpace, GridSpace
+from hks_jax.fem.space import GridSpace
 from hks_jax.fem.stencil import StencilOperator, coefficients_of
 from hks_jax.linear.operators import DiagonalOperator, Operator
 from hks_jax.linear.symmetric_pencil import NullSpace
@@ -42,50 +42,30 @@ def cropped(pencil: Pencil) -> Pencil:
 
 
 def in_box(pencil: Pencil, k: int) -> Pencil:
-    """Return a pencil on the box around a grid's domain with the same k lowest eigenpairs; see `from_box`.
+    """Return a pencil with the same k lowest eigenpairs whose unknowns are all nodes of the grid, or the given pencil.
 
-    If most nodes of the box are free, the unknowns are all its nodes. Each node i that is not free then gets a separate
-    equation: in row i of both matrices, only the diagonal entries Mᵢᵢ = m and Kᵢᵢ = σm are not zero. The eigenvalue σ
-    of this equation is above the lowest quarter of the spectrum; the other eigenvectors vanish at node i. Otherwise the
-    unknowns stay the same, also if k exceeds a quarter of their number, or if the pencil is traced, as `jax.jit`
-    compiles code for each mask anyway.
+    Each node i that is not free gets a separate equation: in row i of both matrices, only the diagonal entries Mᵢᵢ = m
+    and Kᵢᵢ = σm are not zero. The eigenvalue σ of this equation is above the lowest quarter of the spectrum; the other
+    eigenvectors vanish at node i. The given pencil is returned if few nodes are free, if k exceeds a quarter of their
+    number, or if the pencil is traced, as `jax.jit` compiles code for each mask anyway.
     """
-    pencil = cropped(pencil)
     space = pencil.space
     if 4 * k > pencil.size or is_traced(jax.lax.stop_gradient(pencil.stiffness)) or not isinstance(space, GridSpace):
         return pencil
     if not _FILLED[space.dimension] * space.free.size <= space.n_dof < space.free.size:
         return pencil
-    whole = space.whole
+    whole, nulls, sums = space.whole, pencil.null_space, pencil.row_sums
+    if nulls is not None:
+        vectors = space.extend(nulls.vectors, outside=0.0)
+        nulls = NullSpace(vectors.reshape(len(vectors), whole.n_dof), nulls.fixed)
+    if sums is not None:  # infinite in the separate equations, so that `Pencil.read` adds nothing to their unknowns
+        sums = jnp.where(space.free, space.extend(sums, outside=0.0), jnp.inf).ravel()
     of_stiffness, of_mass = (coefficients_of(each, space) for each in (pencil.stiffness, pencil.mass))
     of_stiffness, of_mass = _with_others(of_stiffness, of_mass, space.free)
     diagonal = isinstance(pencil.mass, DiagonalOperator)
     mass: Operator = DiagonalOperator(of_mass.ravel()) if diagonal else StencilOperator(of_mass, whole)
-    nulls = pencil.null_space
-    if nulls is not None:
-        vectors = space.extend(nulls.vectors, outside=0.0)
-        nulls = NullSpace(vectors.reshape(len(vectors), whole.n_dof), nulls.fixed)
-    sums = pencil.row_sums
-    if sums is not None:  # infinite in the separate equations, so that `Pencil.read` adds nothing to their unknowns
-        sums = jnp.where(space.free, space.extend(sums, outside=0.0), jnp.inf).ravel()
     stiffness = StencilOperator(of_stiffness, whole)
     return replace(pencil, stiffness=stiffness, mass=mass, space=whole, null_space=nulls, row_sums=sums)
-
-
-def to_box(vectors: Float[Array, "k n_dof"], space: FunctionSpace, boxed: FunctionSpace) -> Float[Array, "k n_box"]:
-    """Return vectors in the space of a pencil ``boxed``, which is that of the given space or its `in_box`."""
-    return vectors if boxed == space else _in_its_box(space).transfer(vectors, boxed)
-
-
-def from_box(vectors: Float[Array, "k n_box"], boxed: FunctionSpace, space: FunctionSpace) -> Float[Array, "k n_dof"]:
-    """Return eigenvectors in a space, given those of a pencil ``boxed``, which is that of the space or its `in_box`."""
-    return vectors if boxed == space else boxed.transfer(vectors, _in_its_box(space))
-
-
-def _in_its_box(space: FunctionSpace) -> GridSpace:
-    """Return the space with the same unknowns on the nodes of the box."""
-    assert isinstance(space, GridSpace)
-    return space.around[1]
 
 
 # Let s be the largest quotient Kᵢᵢ/Mᵢᵢ of the free nodes, a Rayleigh quotient, or for a lumped mass Gershgorin's upper

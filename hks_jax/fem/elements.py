@@ -35,22 +35,22 @@ def element_matrices(
     form: WeakForm,
     x: Float[Array, "q m"] | None,
     fields: Mapping[str, Array],
-    frames: Float[Array, "q m d"] | None = None,
+    jacobians: Float[Array, "q m d"] | None = None,
 ) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
     """Return stiffness and mass of one element.
 
     The metric T, the density of the volume element (√|T| unless the operator is Fick's), the positions x and the fields
-    are given at the quadrature points. If the frames ∂x/∂ξ are given,
-    gradients and metric in forms refer to the axes of space, otherwise to the element's coordinates ξ.
+    are given at the quadrature points. If the Jacobians ∂x/∂ξ are given, gradients and metric in forms refer to the
+    axes of space, otherwise to the element's coordinates ξ.
     """
     h, dh = jnp.asarray(element.values, metric.dtype), jnp.asarray(element.gradients, metric.dtype)
     volume = jnp.asarray(element.weights, metric.dtype) * density
     inverse = spd.inverse(metric)
-    if frames is not None:
+    if jacobians is not None:
         product = partial(jnp.einsum, precision="highest")
-        dual = product("qxa,qab->qxb", frames, spd.inverse(product("qxa,qxb->qab", frames, frames)))
+        dual = product("qxa,qab->qxb", jacobians, spd.inverse(product("qxa,qxb->qab", jacobians, jacobians)))
         dh = product("qxa,qia->qix", dual, dh)
-        metric, inverse = (product("qxa,qab,qyb->qxy", f, t, f) for f, t in ((dual, metric), (frames, inverse)))
+        metric, inverse = (product("qxa,qab,qyb->qxy", f, t, f) for f, t in ((dual, metric), (jacobians, inverse)))
     functions = of_components(ShapeFunction(h, dh), form.components)
     points = Point(metric, inverse, x, fields)
     stiffness, mass = (integrate(each, volume, functions, points) for each in (form.stiffness, form.mass))

@@ -83,8 +83,8 @@ def checked_field(
     if positive:
         values = jnp.where(values > 0, values, jnp.nan)
     if inside is not None and not inside.all():
-        known = mask_for(values, inside)
-        values = jnp.where(known.reshape(*inside.shape, *(1,) * rest), values, 1)
+        within = mask_for(values, inside)
+        values = jnp.where(within.reshape(*inside.shape, *(1,) * rest), values, 1)
     return Field(values, at)
 
 

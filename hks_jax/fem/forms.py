@@ -65,7 +65,7 @@ class WeakForm(NamedTuple):
     mass: Form = l2
     lumped: bool = False  # whether the mass becomes the diagonal matrix of its row sums
     components: int = 1  # the number of components of a function
-    own: bool = False  # whether a form is the user's, so that no property of the operator is known
+    custom: bool = False  # whether a form is the user's, so that no property of the operator is known
     cancelling: bool = False  # whether shape functions are evaluated where the leading error of signatures cancels
     fick: bool = False  # whether the volume element is that of space, and D = T⁻¹ is interpolated
     checked: bool = True  # whether symmetry is checked after assembly; otherwise unsymmetric matrices become NaN

@@ -42,16 +42,16 @@ def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace
     domain, elements = (mask_for(tensors, mask) for mask in (space.domain, space.elements))
     if operator.fick:
         tensors, density = _diffusion(field.domain_tensors, domain)
-    x = grid_points(field.grid, space, tensors.dtype) if operator.own else None
+    x = grid_points(field.grid, space, tensors.dtype) if operator.custom else None
     geometry = Geometry(domain, elements, couplings_for(tensors, space), gradients, weights, steps, x)
     settings = Settings(space.periodic, field.interpolation, operator)
     *matrices, lumped, volume = _grid_integrals(settings, geometry, tensors, fields)
     metric = SampledMetric(jax.lax.stop_gradient(field.tensors), steps, field.interpolation, operator.fick)
     if operator.components > 1:
-        own, kept = vector_space(space, operator.components), np.flatnonzero(space.elements)
-        one, other = (gathered(own, each[kept]) for each in matrices)
-        sums = row_sums_of(own, matrices[1][kept])
-        return assembled(one, other, sums, None, volume, None, own, operator, fields)
+        functions, kept = vector_space(space, operator.components), np.flatnonzero(space.elements)
+        one, other = (gathered(functions, each[kept]) for each in matrices)
+        sums = row_sums_of(functions, matrices[1][kept])
+        return assembled(one, other, sums, None, volume, None, functions, operator, fields)
     stiffness, consistent = (StencilOperator(coefficients=each, space=space) for each in matrices)
     return assembled(stiffness, consistent, lumped, metric, volume, density, space, operator, fields)
 
@@ -244,11 +244,11 @@ def _in_slabs(
         def part(values: Array, size: int = planes, axis: int = 0) -> Array:
             return jax.lax.dynamic_slice_in_dim(values, start, size, axis)
 
-        def own(field: Field) -> Field:
+        def of_planes(field: Field) -> Field:
             size = planes + (field.at == "nodes")
             return field if field.at == "everywhere" else Field(part(field.values, size), field.at)
 
-        some = {name: own(field) for name, field in given.items()}
+        some = {name: of_planes(field) for name, field in given.items()}
         own_elements = part(elements) & ~again.reshape(-1, *[1] * len(others))
         *both, volume = of_slab(own_elements, None if x is None else part(x), some)
         stiffness, mass = (
@@ -310,22 +310,22 @@ def assemble_mesh(
     shape = len(space.cells), element.weights.size
     if curved:
         slopes = jnp.asarray(element.gradients, nodes.dtype)
-        frames = oriented(jnp, jnp.einsum("qia,nix->nqxa", slopes, nodes[space.cells], precision="highest"))
-        metric = spd.positive_or_nan(jnp.einsum("nqxa,nqxb->nqab", frames, frames, precision="highest"))
+        jacobians = oriented(jnp, jnp.einsum("qia,nix->nqxa", slopes, nodes[space.cells], precision="highest"))
+        metric = spd.positive_or_nan(jnp.einsum("nqxa,nqxb->nqab", jacobians, jacobians, precision="highest"))
     else:
-        metric, frames = (jnp.broadcast_to(x[:, None], (*shape, *x.shape[1:])) for x in (mesh.metric, mesh._edges))
+        metric, jacobians = (jnp.broadcast_to(x[:, None], (*shape, *x.shape[1:])) for x in (mesh.metric, mesh._edges))
     held = {
         name: field.at_points(lambda x: x[space.cells], element.values, shape[:1]) for name, field in fields.items()
     }
-    x, seen = (mesh_points(nodes, space), frames) if operator.own else (None, None)
+    x, seen = (mesh_points(nodes, space), jacobians) if operator.custom else (None, None)
 
     density = metric_density = jnp.sqrt(spd.determinant(metric))
     if operator.fick:  # the volume element is that of space
-        density = jnp.sqrt(spd.determinant(jnp.einsum("nqxa,nqxb->nqab", frames, frames, precision="highest")))
+        density = jnp.sqrt(spd.determinant(jnp.einsum("nqxa,nqxb->nqab", jacobians, jacobians, precision="highest")))
     integrals = jax.vmap(partial(element_matrices, element=element, form=operator))
-    stiffness, mass = integrals(metric, density, x=x, fields=held, frames=seen)
-    own = space if operator.components == 1 else vector_space(space, operator.components)
-    lumped = volumes = row_sums_of(own, mass)
+    stiffness, mass = integrals(metric, density, x=x, fields=held, jacobians=seen)
+    functions = space if operator.components == 1 else vector_space(space, operator.components)
+    lumped = volumes = row_sums_of(functions, mass)
     weights, ratio = element.weights.astype(metric.dtype), None
     if operator.fick or "density" in fields:
         volumes = metric_density @ weights
@@ -336,8 +336,8 @@ def assemble_mesh(
     if space.degree == 1:
         own_metric, of_space = jax.lax.stop_gradient((mesh.metric, mesh.metric_of_space))
         sampled = SampledMetric(own_metric, None, of_space=of_space)
-    matrices = gathered(own, stiffness), gathered(own, mass)
-    return assembled(*matrices, lumped, sampled, jnp.sum(volumes), ratio, own, operator, fields)
+    matrices = gathered(functions, stiffness), gathered(functions, mass)
+    return assembled(*matrices, lumped, sampled, jnp.sum(volumes), ratio, functions, operator, fields)
 
 
 def _mean_over_cells(space: MeshSpace, weighted: Float[Array, " n"], weights: Float[Array, " n"]) -> Array:

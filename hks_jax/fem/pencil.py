@@ -20,6 +20,9 @@ from hks_jax.linear.pattern import SparsePattern
 from hks_jax.linear.symmetric_pencil import NullSpace, SymmetricPencil
 from hks_jax.traced import is_staged
 
+Inclusions = tuple[tuple[int, ...], ...]
+"""See `MirrorPencil.including`."""
+
 
 class Pencil(SymmetricPencil):
     """The stiffness K and the positive definite mass M of functions on a domain, or a pair of the user's matrices.
@@ -113,6 +116,11 @@ class Pencil(SymmetricPencil):
         """The pencil itself, as the only part."""
         return (self,)
 
+    @property
+    def including(self) -> Inclusions:
+        """The pencil itself is the only part that contains its functions; see `MirrorPencil`."""
+        return ((0,),)
+
 
 @jax.jit
 def _read(mass: Operator, row_sums: Float[Array, " n_dof"], functions: Float[Array, "... n_dof"]) -> Array:
@@ -128,14 +136,19 @@ class MirrorPencil(eqx.Module):
 
     Attributes:
         parts: the 2^m pencils; the first one has Neumann conditions on all mirrors and glued rims.
-        including: for each part, itself and the earlier parts whose function spaces contain its function space. By the
-            min–max principle, eigenvalue i of a part is not less than eigenvalue i of a part with a larger function
-            space. A part whose functions belong to c parts has at most the fraction 1/c of the lowest eigenvalues of
-            the doubled domain.
     """
 
     parts: tuple[Pencil, ...]
-    including: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+
+    @property
+    def including(self) -> Inclusions:
+        """For each part, itself and the earlier parts whose function spaces contain its function space.
+
+        By the min–max principle, eigenvalue i of a part is not less than eigenvalue i of a part with a larger function
+        space. A part whose functions belong to c parts has at most the fraction 1/c of the lowest eigenvalues of the
+        doubled domain.
+        """
+        return _inclusions(tuple(part.space for part in self.parts))
 
     @property
     def measured(self) -> bool:
@@ -168,6 +181,12 @@ class MirrorPencil(eqx.Module):
         return self.parts[0].density
 
 
+@lru_cache(maxsize=16)
+def _inclusions(spaces: tuple[FunctionSpace, ...]) -> Inclusions:
+    free = [space.free for space in spaces]
+    return tuple(tuple(j for j in range(i + 1) if not (mask & ~free[j]).any()) for i, mask in enumerate(free))
+
+
 AnyPencil: TypeAlias = Pencil | MirrorPencil
 
 
@@ -178,7 +197,7 @@ def from_lower_bound(pencil: AnyPencil) -> tuple[AnyPencil, Float[Array, ""]]:
         return pencil, jnp.zeros((), pencil.parts[0].stiffness.dtype)
     origin = jnp.min(jnp.stack(bounds))
     parts = tuple(part.counted_from(origin) for part in pencil.parts)
-    return (MirrorPencil(parts, pencil.including) if isinstance(pencil, MirrorPencil) else parts[0]), origin
+    return (MirrorPencil(parts) if isinstance(pencil, MirrorPencil) else parts[0]), origin
 
 
 def assembled(
@@ -194,7 +213,7 @@ def assembled(
 ) -> Pencil:
     """Return the pencil of K and M and its known properties; ``lumped`` has the row sums of M at all nodes."""
     mass = DiagonalOperator(entries=space.restrict(lumped)) if operator.lumped else consistent
-    if operator.own:
+    if operator.custom:
         return Pencil(stiffness, mass, None, None, space)
     nulls = bound = None
     if "potential" in fields:
@@ -203,8 +222,8 @@ def assembled(
         nulls = _constants(space, lumped)
     sums = space.restrict(lumped) if operator.cancelling else None
     weighted = jnp.sum(lumped) if operator.fick or "density" in fields else None
-    known: dict[str, Any] = {"null_space": nulls, "lower_bound": bound, "row_sums": sums, "density": density}
-    return Pencil(stiffness, mass, metric, volume, space, **known, weighted_volume=weighted)
+    properties: dict[str, Any] = {"null_space": nulls, "lower_bound": bound, "row_sums": sums, "density": density}
+    return Pencil(stiffness, mass, metric, volume, space, **properties, weighted_volume=weighted)
 
 
 # With a potential V and a density ρ, the stiffness is K = A + ∫ρV hᵢhⱼ, where A ⪰ 0. If the potential is at least v at

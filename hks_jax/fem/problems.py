@@ -7,10 +7,11 @@ from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.boundary import BoundarySpec, doubled_problems, normalise_boundary
-from hks_jax.fem.space import FunctionSpace, GridSpace, MeshSpace, grid_space, mesh_space
+from hks_jax.fem.space import GridSpace, MeshSpace, grid_space, mesh_space
 
 MESH_BOUNDARIES = ("neumann", "dirichlet", "mean")
-S = TypeVar("S", bound=FunctionSpace)
+
+S = TypeVar("S", GridSpace, MeshSpace)
 
 
 def problems_of(
@@ -25,49 +26,42 @@ def problems_of(
     Warns:
         AccuracyWarning: the mask does not reach the sides of the grid on which ``"dirichlet"`` acts.
     """
+    spaces: list[GridSpace] | list[MeshSpace]
     if isinstance(domain, SimplicialMesh):
         if boundary not in MESH_BOUNDARIES:
             raise ValueError(f"boundary: got {boundary!r}; expected one of {', '.join(map(repr, MESH_BOUNDARIES))}")
         conditions = ("neumann", "dirichlet") if boundary == "mean" else (str(boundary),)
-        of_mesh = _spaces(lambda condition: mesh_space(domain.triangulation, condition, degree), conditions, boundary)
-        return _doubled(of_mesh, mirrored=False)
-    sides = normalise_boundary(boundary, domain.grid.dimension)
-    spaces = _spaces(lambda problem: grid_space(domain.grid, problem), doubled_problems(sides), boundary)
-    if any("dirichlet" in pair for pair in sides) and (spaces[0].free == spaces[0].domain).all():
-        where = (
-            'acts on the sides of the grid, which the mask does not reach. For the rim of the mask pass "dirichlet-rim"'
-            if sides[-1] == ("neumann", "neumann")
-            else "acts nowhere: there is no mask, and so no rim. Leave this condition out"
+        spaces = _spaces(lambda condition: mesh_space(domain.triangulation, condition, degree), conditions, boundary)
+        mirrored = False
+    else:
+        sides = normalise_boundary(boundary, domain.grid.dimension)
+        spaces = _spaces(lambda problem: grid_space(domain.grid, problem), doubled_problems(sides), boundary)
+        mirrored = any("mirror" in pair for pair in sides)
+        if any("dirichlet" in pair for pair in sides) and (spaces[0].free == spaces[0].domain).all():
+            where = (
+                "acts on the sides of the grid, which the mask does not reach. For the rim of the mask pass "
+                '"dirichlet-rim"'
+                if sides[-1] == ("neumann", "neumann")
+                else "acts nowhere: there is no mask, and so no rim. Leave this condition out"
+            )
+            warn_of_accuracy(f'boundary: got {boundary!r}, but "dirichlet" {where}')
+    if len(spaces) > 1 and spaces[0].n_dof == spaces[-1].n_dof:  # all problems are the same
+        raise ValueError(
+            'boundary: got "mirror", but the mask reaches no side of the grid, where the mirrors are. Pass "mean" '
+            "for the rim of the mask"
+            if mirrored
+            else 'boundary: got "mean", but the domain has no rim; pass "neumann"'
         )
-        warn_of_accuracy(f'boundary: got {boundary!r}, but "dirichlet" {where}')
-    return _doubled(spaces, mirrored=any("mirror" in pair for pair in sides))
+    return spaces
 
 
 def _spaces(space_of: Callable[[Any], S], problems: Sequence[Any], boundary: BoundarySpec) -> list[S]:
     """Return the space of each problem; raise ValueError if only the first problem has free nodes."""
     first = space_of(problems[0])
     try:
-        return [first, *map(space_of, problems[1:])]
+        return [first, *(space_of(problem) for problem in problems[1:])]
     except ValueError as error:  # the functions of these problems vanish on the rim or at mirrors
         raise ValueError(
             f"boundary: got {boundary!r}, but all nodes of the domain are on its rim or sides; the conditions "
             '"mean" and "mirror" need inner nodes. Pass "neumann", or use a finer grid or mesh, or a thicker mask'
         ) from error
-
-
-def _doubled(spaces: list[S], mirrored: bool) -> list[S]:
-    """Return the spaces of all problems; raise ValueError if all of them are the same."""
-    if len(spaces) == 1 or spaces[0].n_dof > spaces[-1].n_dof:
-        return spaces
-    if mirrored:
-        raise ValueError(
-            'boundary: got "mirror", but the mask reaches no side of the grid, where the mirrors are. Pass "mean" '
-            "for the rim of the mask"
-        )
-    raise ValueError('boundary: got "mean", but the domain has no rim; pass "neumann"')
-
-
-def inclusions(spaces: Sequence[FunctionSpace]) -> tuple[tuple[int, ...], ...]:
-    """Return, for each space, itself and the earlier spaces that contain its functions; see `MirrorPencil`."""
-    free = [space.free for space in spaces]
-    return tuple(tuple(j for j in range(i + 1) if not (own & ~free[j]).any()) for i, own in enumerate(free))

@@ -320,7 +320,7 @@ def _outer(axes: Sequence[Bool[np.ndarray, "_m _n"]]) -> Bool[Array, "ms *ns"]:
     result = jnp.ones((), bool)
     if not all(axis.all() for axis in axes):
         # The optimization barrier keeps the compiler from computing the outer product during compilation.
-        known = jax.lax.optimization_barrier([jnp.asarray(axis) for axis in axes])
+        masks = jax.lax.optimization_barrier([jnp.asarray(axis) for axis in axes])
         places = [tuple(n if i % d == axis else 1 for i, n in enumerate(whole)) for axis in range(d)]
-        result = reduce(jnp.logical_and, [axis.reshape(place) for axis, place in zip(known, places, strict=True)])
+        result = reduce(jnp.logical_and, [axis.reshape(place) for axis, place in zip(masks, places, strict=True)])
     return jnp.broadcast_to(result, whole).reshape(-1, *whole[d:])

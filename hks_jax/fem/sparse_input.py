@@ -100,8 +100,8 @@ def sparse_pencil(
 
 def pencil_of(domain: Any, boundary: BoundarySpec, mass: MassKind, quadrature: Quadrature = "gauss") -> AnyPencil:
     """Return the pencil of a field, a mesh, a matrix K or a pair (K, M); a given pencil is checked and returned."""
-    matrices = BCOO | BCSR | Operator | np.ndarray | jax.Array | list | LinearOperator
-    matrix = issparse(domain) or isinstance(domain, matrices)
+    kinds = BCOO | BCSR | Operator | np.ndarray | jax.Array | list | LinearOperator
+    matrix = issparse(domain) or isinstance(domain, kinds)
     if not matrix and not isinstance(domain, SymmetricPencil | MirrorPencil | tuple):
         return assemble(domain, boundary, mass, quadrature=quadrature)
     if (boundary, mass, quadrature) != ("neumann", "consistent", "gauss"):
@@ -122,8 +122,8 @@ def pencil_of(domain: Any, boundary: BoundarySpec, mass: MassKind, quadrature: Q
 
 def _require_definite_mass(pencil: Pencil) -> None:
     """Raise ValueError if the user's own M, in a matrix or a form, is concrete and not positive definite."""
-    own = isinstance(pencil.space, MatrixSpace) or pencil.volume is None
-    if not own or isinstance(pencil.mass, DiagonalOperator) or is_traced(pencil):
+    custom = isinstance(pencil.space, MatrixSpace) or pencil.volume is None
+    if not custom or isinstance(pencil.mass, DiagonalOperator) or is_traced(pencil):
         return
     negative, sound = inertia_on_host(pencil.mass.to_scipy().tocsc(), identity(pencil.size, format="csc"), 0.0)
     if negative or not sound:
@@ -219,43 +219,37 @@ def _pencil(K: Any, M: Any) -> SymmetricPencil:
 
 def _entries(name: str, matrix: Any) -> _Entries:
     """Return the entries of a square matrix; check the symmetry of the matrix unless the entries are traced."""
+    if not isinstance(matrix, BCOO | BCSR | Operator) and not issparse(matrix):
+        matrix = real_array(name, matrix)
+    if isinstance(matrix, BCOO | BCSR) and (matrix.n_batch or matrix.n_dense):
+        raise ValueError(f"{name}: got a BCOO with batch or dense axes; expected none (use jax.vmap over its data)")
+    if len(matrix.shape) != 2 or matrix.shape[0] != matrix.shape[1] or matrix.shape[0] == 0:
+        remedy = ". For tensors, pass TensorField(grid, tensors)" * (len(matrix.shape) > 2)
+        raise ValueError(f"{name}: got shape {tuple(matrix.shape)}; expected a square matrix (n, n){remedy}")
+    n = matrix.shape[0]
     if isinstance(matrix, BCSR):
         matrix = matrix.to_bcoo()
     if isinstance(matrix, BCOO):
-        entries = _of_bcoo(name, matrix)
+        if is_traced(matrix.indices):
+            raise ValueError(
+                f"{name}: its indices are traced; expected a known pattern. Make the array of indices outside jax.jit "
+                "and the matrix from it inside, or make the pencil outside with `sparse_pencil` and pass it"
+            )
+        rows, cols = np.asarray(matrix.indices).T
+        valid = np.flatnonzero((rows < n) & (cols < n))  # other indices are padding
+        values, rows, cols = matrix.data[valid], rows[valid], cols[valid]
     elif isinstance(matrix, Operator):
         values, (rows, cols) = matrix.triplets()
-        entries = _Entries(values, rows, cols, matrix.size)
     elif issparse(matrix):
-        _check_square(name, matrix.shape)
         held = matrix.tocsr().tocoo()  # entries in the same place are added
-        entries = _Entries(real_array(name, held.data), held.row, held.col, held.shape[0])
+        values, rows, cols = held.data, held.row, held.col
     else:
-        array = real_array(name, matrix)
-        _check_square(name, array.shape)
-        if is_traced(array):
-            rows, cols = np.divmod(np.arange(array.size), array.shape[0])
-        else:
-            rows, cols = np.nonzero(np.asarray(array))
-        entries = _Entries(array[rows, cols], rows, cols, array.shape[0])
-    if not is_traced(entries.values):
-        places, remedy = (entries.rows, entries.cols), f"If this is noise, pass ({name} + {name}.T) / 2"
-        require_symmetric(name, entries.values, places, entries.size, remedy)
-    return entries
-
-
-def _of_bcoo(name: str, matrix: BCOO) -> _Entries:
-    if matrix.n_batch or matrix.n_dense:
-        raise ValueError(f"{name}: got a BCOO with batch or dense axes; expected none (use jax.vmap over its data)")
-    _check_square(name, matrix.shape)
-    if is_traced(matrix.indices):
-        raise ValueError(
-            f"{name}: its indices are traced; expected a known pattern. Make the array of indices outside jax.jit and "
-            "the matrix from it inside, or make the pencil outside with `sparse_pencil` and pass it"
-        )
-    rows, cols = np.asarray(matrix.indices).T
-    valid = (rows < matrix.shape[0]) & (cols < matrix.shape[1])  # other indices are padding
-    return _Entries(real_array(name, matrix.data)[np.flatnonzero(valid)], rows[valid], cols[valid], matrix.shape[0])
+        rows, cols = np.divmod(np.arange(n * n), n) if is_traced(matrix) else np.nonzero(np.asarray(matrix))
+        values = matrix[rows, cols]
+    values = real_array(name, values)
+    if not is_traced(values):
+        require_symmetric(name, values, (rows, cols), n, f"If this is noise, pass ({name} + {name}.T) / 2")
+    return _Entries(values, rows, cols, n)
 
 
 def _diagonal(M: Any, n: int, dtype: np.dtype) -> Array | None:
@@ -270,12 +264,6 @@ def _diagonal(M: Any, n: int, dtype: np.dtype) -> Array | None:
     if entries.shape != (n,):
         raise ValueError(f"M: got a diagonal of shape {entries.shape}; expected {(n,)}")
     return entries
-
-
-def _check_square(name: str, shape: tuple[int, ...]) -> None:
-    if len(shape) != 2 or shape[0] != shape[1] or shape[0] == 0:
-        remedy = ". For tensors, pass TensorField(grid, tensors)" * (len(shape) > 2)
-        raise ValueError(f"{name}: got shape {tuple(shape)}; expected a square matrix (n, n){remedy}")
 
 
 @partial(jax.jit, static_argnums=3)

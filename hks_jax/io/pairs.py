@@ -83,7 +83,7 @@ def pairs_of(name: str, arrays: Mapping[str, np.ndarray], pencil: AnyPencil) -> 
     ]
     pairs: Eigenpairs = problems[0]
     if isinstance(pencil, MirrorPencil):
-        pairs = DoubledEigenpairs.of(problems, pencil.including, len(arrays["eigenvalues"]))
+        pairs = DoubledEigenpairs.of(problems, len(arrays["eigenvalues"]))
     gap = np.concatenate([_residuals(each) for each in pairs.problems])
     ends = np.array([pairs.next_eigenvalue, *pairs.eigenvalues[-1:], pairs.spectral_origin])
     size = np.max(np.abs(ends[np.isfinite(ends)]))

@@ -201,11 +201,11 @@ def _symmetric(name: str, matrix: Any) -> Matrix:
     if array.ndim != 2 or array.shape[0] != array.shape[1] or array.size == 0:
         raise ValueError(f"{name}: got shape {array.shape}; expected (n, n). Use jax.vmap for several matrices")
     if not is_traced(array):
-        known, limit = np.asarray(array), float(jnp.finfo(array.dtype).eps) ** 0.5
+        entries, limit = np.asarray(array), float(jnp.finfo(array.dtype).eps) ** 0.5
         with np.errstate(invalid="ignore"):
-            symmetric = np.abs(known - known.T).max() <= limit * np.abs(known).max()
+            symmetric = np.abs(entries - entries.T).max() <= limit * np.abs(entries).max()
         if not symmetric:
-            rows, cols = np.indices(known.shape).reshape(2, -1)
+            rows, cols = np.indices(entries.shape).reshape(2, -1)
             remedy = f"Pass ({name} + {name}.T) / 2 if this is noise"
-            require_symmetric(name, known.ravel(), (rows, cols), len(known), remedy, limit)
+            require_symmetric(name, entries.ravel(), (rows, cols), len(entries), remedy, limit)
     return (array + array.T) / 2

@@ -133,9 +133,9 @@ class FactorisedMatrix(eqx.Module):
         return _nan_unless(jnp.isfinite(self.error), function(self.matrix.flat(), jax.lax.stop_gradient(self.factor)))
 
 
-def _nan_unless(known: Bool[Array, ""], x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Return x if ``known``, otherwise NaN with NaN derivatives; `jnp.where` would make these derivatives zero."""
-    return x * jnp.where(known, 1.0, jnp.nan).astype(x.dtype)
+def _nan_unless(certain: Bool[Array, ""], x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Return x if ``certain``, otherwise NaN with NaN derivatives; `jnp.where` would make these derivatives zero."""
+    return x * jnp.where(certain, 1.0, jnp.nan).astype(x.dtype)
 
 
 def factorised(matrix: PatternedOperator, name: str = "matrix") -> FactorisedMatrix:
@@ -146,11 +146,11 @@ def factorised(matrix: PatternedOperator, name: str = "matrix") -> FactorisedMat
     """
     ones = jnp.ones(matrix.size, matrix.dtype)
     pencil = tabulated(SymmetricPencil(matrix, DiagonalOperator(ones)))
-    known = jax.lax.stop_gradient(pencil)
+    constant = jax.lax.stop_gradient(pencil)
     dissection = jax.tree.map(jax_array, dissect(matrix.pattern))
-    factor, trial, tries = certain_factorisation(dissection, known, jnp.zeros((), matrix.dtype))
+    factor, trial, tries = certain_factorisation(dissection, constant, jnp.zeros((), matrix.dtype))
     if not is_traced(trial) and not trial.sound:
-        raise ValueError(_failure(name, known, factor))
+        raise ValueError(_failure(name, constant, factor))
     # For any matrix E and a random unit vector v, ‖Ev‖ is about the Frobenius norm of E divided by √n.
     error = jnp.where(trial.sound & (tries == 1), trial.rate * math.sqrt(matrix.size), jnp.inf)
     return FactorisedMatrix(pencil.stiffness, factor, trial.sound, error)

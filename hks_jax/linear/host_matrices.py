@@ -116,8 +116,8 @@ def near_zero(
     # A sum wᵢ that is known to be zero, because K annihilates constants, does not change.
     sizes, sums = abs(K), K @ np.ones(pencil.size)
     limits = sizes @ np.ones(pencil.size)
-    known = np.abs(sums) <= _EXACT * limits if accurate else np.zeros(pencil.size, bool)
-    changes = np.where(known, limits, 2 * limits) @ columns**2 - np.sum(columns * (sizes @ columns), axis=0)
+    exact = np.abs(sums) <= _EXACT * limits if accurate else np.zeros(pencil.size, bool)
+    changes = np.where(exact, limits, 2 * limits) @ columns**2 - np.sum(columns * (sizes @ columns), axis=0)
     squares = np.sum(columns * (M @ columns), axis=0)
     rounding = np.finfo(source.stiffness.dtype).eps * changes / squares
     return np.sum(columns * (K @ columns), axis=0) / squares, rounding

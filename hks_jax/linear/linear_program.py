@@ -51,32 +51,32 @@ class HostMap(NamedTuple):
 def linear_program(
     function: Callable[..., Any],
     settings: tuple[Hashable, ...],
-    known: tuple[Any, ...],
+    constants: tuple[Any, ...],
     x: Any,
     y: Any,
     host_map: Callable[..., HostMap | None] | None = None,
 ) -> Any:
-    """Return y = function(*settings, *known, x), which is linear in the floating-point arrays of x.
+    """Return y = function(*settings, *constants, x), which is linear in the floating-point arrays of x.
 
     Under `jax.jit`, under `jax.vmap` over constants, and on accelerators, JAX transposes the function.
 
     Args:
         function: a function at module level, so that it is compiled once.
         settings: the static arguments.
-        known: the constants: pytrees of arrays.
+        constants: pytrees of arrays.
         x: a pytree. The function receives None in place of all leaves that are not floating-point arrays.
         y: a pytree with the shapes and dtypes of the result.
-        host_map: a function of ``settings`` and ``known``. It returns the `HostMap` for NumPy, or None if the compiled
-            function takes less time.
+        host_map: a function of ``settings`` and ``constants``. It returns the `HostMap` for NumPy, or None if the
+            compiled function takes less time.
     """
     x = eqx.filter(x, _is_inexact)
-    if not is_concrete_on_cpu(known):
-        return _evaluated(function, settings, known, x)
-    constants, of_known = jax.tree.flatten(known)
+    if not is_concrete_on_cpu(constants):
+        return _evaluated(function, settings, constants, x)
+    fixed, of_constants = jax.tree.flatten(constants)
     leaves, of_x = jax.tree.flatten(x)
     results, of_y = jax.tree.flatten(y)
-    linear_map = _Map(function, settings, host_map, of_known, of_x, _shapes(leaves), of_y, _shapes(results))
-    return jax.tree.unflatten(of_y, _linear_program.bind(*constants, *leaves, linear_map=linear_map))
+    linear_map = _Map(function, settings, host_map, of_constants, of_x, _shapes(leaves), of_y, _shapes(results))
+    return jax.tree.unflatten(of_y, _linear_program.bind(*fixed, *leaves, linear_map=linear_map))
 
 
 def _is_inexact(leaf: Any) -> bool:
@@ -93,7 +93,7 @@ class _Map(NamedTuple):
     function: Callable[..., Any]
     settings: tuple[Hashable, ...]
     host_map: Callable[..., HostMap | None] | None
-    of_known: jax.tree_util.PyTreeDef
+    of_constants: jax.tree_util.PyTreeDef
     of_x: jax.tree_util.PyTreeDef
     x: tuple[jax.ShapeDtypeStruct, ...]
     of_y: jax.tree_util.PyTreeDef
@@ -106,26 +106,28 @@ class _Map(NamedTuple):
 
     def split(self, leaves: Sequence[Any]) -> tuple[list[Any], list[Any]]:
         """Return the leaves of the constants, and the linear inputs."""
-        n = self.of_known.num_leaves
+        n = self.of_constants.num_leaves
         return list(leaves[:n]), list(leaves[n:])
 
     def traced(self, *leaves: Any) -> list[Any]:
         """Return the results of the traceable function or of its transpose."""
-        constants, given = self.split(leaves)
-        known = jax.tree.unflatten(self.of_known, constants)
+        fixed, given = self.split(leaves)
+        constants = jax.tree.unflatten(self.of_constants, fixed)
 
         def forward(*x: Any) -> list[Any]:
-            return jax.tree.leaves(_evaluated(self.function, self.settings, known, jax.tree.unflatten(self.of_x, x)))
+            return jax.tree.leaves(
+                _evaluated(self.function, self.settings, constants, jax.tree.unflatten(self.of_x, x))
+            )
 
         return list(jax.linear_transpose(forward, *self.x)(given)) if self.transposed else forward(*given)
 
     def computed(self, *leaves: Any) -> list[Any]:
         """Return the results for concrete arrays, by NumPy or by one compiled program."""
         with jax.core.eval_context():
-            constants, given = self.split(leaves)
-            known, on_host = jax.tree.unflatten(self.of_known, constants), None
+            fixed, given = self.split(leaves)
+            constants, on_host = jax.tree.unflatten(self.of_constants, fixed), None
             if self.host_map is not None and is_concrete_on_cpu(given):
-                on_host = self.host_map(*self.settings, *known)
+                on_host = self.host_map(*self.settings, *constants)
             if on_host is None:
                 return _compiled(self, *leaves)
             with np.errstate(all="ignore"):
@@ -138,8 +140,8 @@ class _Map(NamedTuple):
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _evaluated(function: Callable[..., Any], settings: tuple[Hashable, ...], known: tuple[Any, ...], x: Any) -> Any:
-    return function(*settings, *known, x)
+def _evaluated(function: Callable[..., Any], settings: tuple[Hashable, ...], constants: tuple[Any, ...], x: Any) -> Any:
+    return function(*settings, *constants, x)
 
 
 @jit_quickly(static_argnums=0)
@@ -166,17 +168,17 @@ def _full(changes: Sequence[Any]) -> list[Any]:
 
 
 def _transpose(cotangents: list[Any], *leaves: Any, linear_map: _Map) -> list[Any]:
-    (constants, x), transposed = linear_map.split(leaves), linear_map._replace(transposed=not linear_map.transposed)
-    results = _linear_program.bind(*constants, *_full(cotangents), linear_map=transposed)
+    (fixed, x), transposed = linear_map.split(leaves), linear_map._replace(transposed=not linear_map.transposed)
+    results = _linear_program.bind(*fixed, *_full(cotangents), linear_map=transposed)
     wanted = map(ad.is_undefined_primal, x)
-    return [None] * len(constants) + [r if each else None for r, each in zip(results, wanted, strict=True)]
+    return [None] * len(fixed) + [r if each else None for r, each in zip(results, wanted, strict=True)]
 
 
 # The constants of a map are concrete, so that only x has a tangent.
 def _jvp(leaves: tuple[Any, ...], changes: tuple[Any, ...], linear_map: _Map) -> tuple[list[Any], list[Any]]:
-    constants, change = linear_map.split(leaves)[0], linear_map.split(changes)[1]
+    fixed, change = linear_map.split(leaves)[0], linear_map.split(changes)[1]
     apply = partial(_linear_program.bind, linear_map=linear_map)
-    return apply(*leaves), apply(*constants, *_full(change))
+    return apply(*leaves), apply(*fixed, *_full(change))
 
 
 def _batch(leaves: tuple[Any, ...], axes: tuple[Any, ...], linear_map: _Map) -> tuple[list[Any], list[int]]:

@@ -4,11 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fields import flat
+from fields import flat, random_spd
 
 import hks_jax as hj
 from hks_jax.eigen import automatic
 from hks_jax.eigen.automatic import choose_for_fit, choose_for_one, choose_solver
+from hks_jax.eigen.shift_invert.shift_invert import ShiftInvert
 
 
 def single(pencil):
@@ -121,6 +122,21 @@ def test_a_process_with_one_domain_takes_shift_invert_for_more_pairs(monkeypatch
     assert [choose_for_one(pencil, k).name for k in (20, 40, 80)] == [*["shift-invert"] * 2, "block-lanczos"]
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert choose_for_one(pencil, 40).name == "block-lanczos"
+
+
+@pytest.mark.parametrize("boundary", ["neumann", "mean"])
+def test_a_second_solver_follows_if_the_first_leaves_doubt(boundary, rng, monkeypatch):
+    """Without a lower bound of the spectrum, shift-invert may fail; each problem of a doubled domain has its own."""
+    monkeypatch.setattr(automatic, "_SMALL", 20)
+    monkeypatch.setattr(automatic, "BlockLanczos", hj.Dense)  # which compiles nothing
+    found = ShiftInvert.lowest
+    field = hj.TensorField(hj.Grid((8, 7), mask=np.arange(56).reshape(8, 7) > 1), random_spd(rng, (8, 7), 0.2))
+    pencil = hj.assemble_forms(field, boundary=boundary)
+    certain = hj.eigenpairs(pencil, 5)
+    monkeypatch.setattr(ShiftInvert, "lowest", lambda *args: (*found(*args)[:2], jnp.asarray(jnp.nan)))
+    pairs = hj.eigenpairs(pencil, 5)
+    assert (certain.solver_name, pairs.solver_name) == ("shift-invert", "dense")
+    np.testing.assert_allclose(pairs.eigenvalues, certain.eigenvalues, atol=1e-9)
 
 
 @pytest.mark.slow

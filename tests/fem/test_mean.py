@@ -8,7 +8,7 @@ from fields import flat, random_spd
 from scipy.spatial import Delaunay
 
 import hks_jax as hj
-from hks_jax.eigen import doubled
+from hks_jax.eigen import all_pencils
 from hks_jax.eigen.one_pencil import pairs_of_pencil
 
 RIM_COEFFICIENT = np.sqrt(np.pi) / 4
@@ -242,7 +242,7 @@ def test_each_problem_of_a_doubled_domain_is_solved_once(shape, lengths, monkeyp
         sizes.append(k)
         return pairs_of_pencil(pencil, solver, k, *more)
 
-    monkeypatch.setattr(doubled, "pairs_of_pencil", counting)
+    monkeypatch.setattr(all_pencils, "pairs_of_pencil", counting)
     pairs = hj.eigenpairs(flat(shape, lengths), 120, "mean", "shift-invert", multiplet="drop")
     assert len(sizes) == 2
     assert [each.k for each in pairs.problems] == sizes

@@ -94,7 +94,7 @@ class ChebyshevFilter(Eigensolver[Pencil]):
             )
 
     def lowest(
-        self, pencil: Pencil, k: int, report: Report = silent, start: Float[Array, "known n_dof"] | None = None
+        self, pencil: Pencil, k: int, report: Report = silent, start: Float[Array, "given n_dof"] | None = None
     ) -> RawPairs:
         """Return the k lowest eigenpairs; the bound is NaN, because the method has no certificate.
 

@@ -148,7 +148,7 @@ def _ordered(
     """Return the k lowest pairs (NaN if missing) and the certified bound (NaN if an eigenvector was found twice)."""
     order = jnp.argsort(values)[:k]
     values, vectors = values[order], vectors[order]
-    known = jnp.isfinite(values)
+    found = jnp.isfinite(values)
     if values.dtype == jnp.float32:
-        bound = jnp.where(jnp.any(measure_pairs(pencil, vectors, values)[2] & known), jnp.nan, bound)
-    return jnp.where(known, values, jnp.nan), jnp.where(known[:, None], vectors, jnp.nan), bound
+        bound = jnp.where(jnp.any(measure_pairs(pencil, vectors, values)[2] & found), jnp.nan, bound)
+    return jnp.where(found, values, jnp.nan), jnp.where(found[:, None], vectors, jnp.nan), bound

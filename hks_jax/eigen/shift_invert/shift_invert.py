@@ -69,12 +69,12 @@ class ShiftInvert(Eigensolver[Pencil]):
         """Return the k lowest eigenpairs, and the shift at which inertia confirmed that none is missing."""
         n, dtype, dimension = pencil.space.n_dof, pencil.stiffness.dtype, pencil.space.dimension
         data, matrices = host_matrices(pencil)
-        known = pencil.null_space is not None
-        lowest = 0.0 if known else np.nan if pencil.lower_bound is None else pencil.lower_bound
+        null_space_known = pencil.null_space is not None
+        lowest = 0.0 if null_space_known else np.nan if pencil.lower_bound is None else pencil.lower_bound
 
         def solve(lowest: ArrayLike, volume: ArrayLike, *data: ArrayLike) -> tuple[np.ndarray, ...]:
             (K, M), origin = matrices(*data), float(np.asarray(lowest))
-            if not known:
+            if not null_space_known:
                 origin = _lower_bound(K, M) if np.isnan(origin) else origin
                 K = K - origin * M
             # K + sM is positive definite for any shift s > 0. The shift is small relative to the lowest positive
@@ -86,7 +86,7 @@ class ShiftInvert(Eigensolver[Pencil]):
             # More BLAS threads hardly accelerate ARPACK's products with its basis, and slow them down on busy cores.
             with threadpool_limits(1, user_api="blas"):
                 values, vectors, bound = self._lanczos(K, M, k, shift, report)
-                if not known and is_remote(values, _rounding(K, M)):
+                if not null_space_known and is_remote(values, _rounding(K, M)):
                     spread = values[-1] - values[0]
                     nearer = values[0] - spread
                     origin, K = origin + nearer, K - nearer * M
