@@ -7,11 +7,11 @@ from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.boundary import BoundarySpec, doubled_problems, normalise_boundary
-from hks_jax.fem.space import GridSpace, MeshSpace, grid_space, mesh_space
+from hks_jax.fem.space import FunctionSpace, GridSpace, MeshSpace, grid_space, mesh_space
 
 MESH_BOUNDARIES = ("neumann", "dirichlet", "mean")
 
-S = TypeVar("S", GridSpace, MeshSpace)
+S = TypeVar("S", bound=FunctionSpace)
 
 
 def problems_of(
@@ -59,7 +59,7 @@ def _spaces(space_of: Callable[[Any], S], problems: Sequence[Any], boundary: Bou
     """Return the space of each problem; raise ValueError if only the first problem has free nodes."""
     first = space_of(problems[0])
     try:
-        return [first, *(space_of(problem) for problem in problems[1:])]
+        return [first, *map(space_of, problems[1:])]
     except ValueError as error:  # the functions of these problems vanish on the rim or at mirrors
         raise ValueError(
             f"boundary: got {boundary!r}, but all nodes of the domain are on its rim or sides; the conditions "
