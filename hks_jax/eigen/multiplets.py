@@ -17,15 +17,21 @@ class Spectrum(NamedTuple):
     rounding: Any  # the rounding error of eigenvalues if no null space is known, otherwise 0
 
 
+_SHIFTED = 16
+"""The factor by which rounding may grow where a solver shifts the matrix."""
+
+
 # If no null space is known, the origin is the lowest computed eigenvalue, so distances from it do not show the rounding
 # errors of its copies. Copies differ by the rounding error of the matrix. In single precision on fine grids, this worst
 # case exceeds the gaps of distinct eigenvalues, whose errors are smaller. So rounding counts only up to a thousandth of
-# the spectrum's length, unless all eigenvalues are equal within rounding.
+# the spectrum's length, unless all eigenvalues are equal within rounding. In double precision, copies may then differ
+# by more, because solvers that shift the matrix increase rounding.
 def gaps_to_next(xp: Any, spectrum: Spectrum) -> Any:
     """Return, for each eigenvalue, the largest gap to the next one at which the two count as equal, (k)."""
     values, _, origin, tolerance, rounding = spectrum
     finfo, length = jnp.finfo(values.dtype), xp.nanmax(values, initial=-xp.inf) - origin
-    rounding = xp.where(length <= rounding, rounding, xp.minimum(rounding, length / 1000))
+    shifted = _SHIFTED * rounding if values.dtype == jnp.float64 else rounding
+    rounding = xp.where(length <= shifted, shifted, xp.minimum(rounding, length / 1000))
     stored = 4 * finfo.eps * xp.abs(values)
     return xp.maximum(xp.maximum(tolerance * (values - origin), stored), xp.maximum(rounding, finfo.tiny))
 
@@ -34,8 +40,9 @@ def gaps_to_next(xp: Any, spectrum: Spectrum) -> Any:
 def is_unconfirmed(xp: Any, spectrum: Spectrum, kept: Any, bound: Any, optional: bool) -> Any:
     """Return whether the bound of a certificate, which may be ``optional``, is below the last kept eigenvalue."""
     last = xp.sum(kept) - 1
-    # The solver may have shifted the matrix, which increases rounding, and counts outside of the copies' errors.
-    needed = spectrum.values[last] - 2 * gaps_to_next(xp, spectrum._replace(rounding=16 * spectrum.rounding))[last]
+    # The solver counts outside of the copies' errors.
+    shifted = spectrum._replace(rounding=_SHIFTED * spectrum.rounding)
+    needed = spectrum.values[last] - 2 * gaps_to_next(xp, shifted)[last]
     return bound < needed if optional else ~(bound >= needed)
 
 

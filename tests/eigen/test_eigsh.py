@@ -217,6 +217,17 @@ BOTTOMS = {  # a matrix, the number of copies of its lowest eigenvalue, a k that
 }
 
 
+@pytest.mark.parametrize(("copies", "others", "k"), [(35, 20, 8), (50, 100, 25)])
+def test_a_high_multiplicity_needs_a_larger_basis(copies, others, k):
+    """ARPACK exhausts the Krylov space of its start vector before k copies are found."""
+    matrix = turned([3.0] * copies + list(np.linspace(5, 9, others)))
+    with pytest.warns(hj.AccuracyWarning, match="cuts a multiple eigenvalue"):
+        pairs = hj.eigsh(matrix, k=k, solver="shift-invert")
+    np.testing.assert_allclose(pairs.eigenvalues, 3.0, rtol=1e-12)
+    assert pairs.converged.all()
+    assert not pairs.unconfirmed
+
+
 @pytest.mark.parametrize(
     ("name", "solver"),
     [

@@ -128,14 +128,18 @@ class ShiftInvert(Eigensolver[Pencil]):
         inverse = LinearOperator(K.shape, matvec=apply_inverse, dtype=np.float64)
         for seed in range(_ROUNDS):
             start = np.random.default_rng(seed).standard_normal(n)
-            basis, before = min(n, max(wanted + 1, self.basis or wanted + wanted // 4 + 20)), solves
-            try:
-                further, others = eigsh(
-                    K, wanted, M, -shift, OPinv=inverse, v0=start, ncv=basis, maxiter=self.max_restarts
-                )
-            except ArpackNoConvergence as stopped:
-                return _padded(stopped.eigenvalues, stopped.eigenvectors, k, np.nan) if seed == 0 else nothing
-            except ArpackError:
+            least, before = max(wanted + 1, self.basis or wanted + wanted // 4 + 20), solves
+            for basis in (min(n, size * least) for size in (1, 2, 4)):
+                try:
+                    further, others = eigsh(
+                        K, wanted, M, -shift, OPinv=inverse, v0=start, ncv=basis, maxiter=self.max_restarts
+                    )
+                    break
+                except ArpackNoConvergence as stopped:
+                    return _padded(stopped.eigenvalues, stopped.eigenvectors, k, np.nan) if seed == 0 else nothing
+                except ArpackError:  # a high multiplicity exhausted a small basis
+                    pass
+            else:
                 return nothing
             order = np.argsort(np.concatenate([values, further]))[:k]
             values = np.concatenate([values, further])[order]
