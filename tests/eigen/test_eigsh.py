@@ -151,7 +151,7 @@ def test_sums_over_eigenvectors_by_hand_are_right_or_nan():
 
 @pytest.mark.slow
 def test_forward_mode_traced_and_batched(rng):
-    pencil, weights = hj.sparse_pencil(*indefinite(300)), jnp.asarray(rng.standard_normal(300))
+    pencil, weights = hj.sparse_pencil(*indefinite(150)), jnp.asarray(rng.standard_normal(150))
     run = jax.jit(lambda pencil: loss(pencil, 12, weights))
     change = next(directions(pencil, rng))
     value, along = jax.jvp(run, (pencil,), (change,))
@@ -332,8 +332,8 @@ def test_a_nearly_incompressible_body_is_located_by_few_factorisations(monkeypat
 
 def twelve_graphs() -> sp.csc_matrix:
     """The Laplacian of twelve equal graphs: all eigenvalues have twelve copies, and zero lies far below the others."""
-    edges = sp.random(150, 150, 0.08, random_state=0).tocsr()
-    edges = edges + edges.T + sp.diags([np.ones(149), np.ones(149)], [1, -1])
+    edges = sp.random(75, 75, 0.16, random_state=0).tocsr()
+    edges = edges + edges.T + sp.diags([np.ones(74), np.ones(74)], [1, -1])
     edges.setdiag(0)
     return sp.kron(sp.eye(12), sp.diags(np.asarray(edges.sum(axis=1)).ravel()) - edges).tocsc()
 
