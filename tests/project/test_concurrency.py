@@ -26,6 +26,7 @@ NAMES = [*OF_FOUR, *OF_TWO]
         *((threads, NAMES[start::3]) for threads in (1, 2) for start in range(3)),
         *((4, OF_FOUR[start::2]) for start in range(2)),
     ],
+    ids=lambda value: "; ".join(value) if isinstance(value, list) else None,
 )
 def test_programs_end(programs, threads):
     run(programs, threads=threads, limit=900)
