@@ -1,22 +1,22 @@
 """Linear maps in derivative rules: outside `jax.jit`, NumPy computes them, or one compiled program for each.
 
-For example, the derivative of the inverse A⁻¹ of a matrix is the linear map dA ↦ −A⁻¹ dA A⁻¹, with the constant A⁻¹::
+For example, the derivative of r = 1/a for each entry of an array is the linear map da ↦ −r da r, with the constant r::
 
-    def change_of_inverse(inverse, dA):
-        return -inverse @ dA @ inverse
+    def change_of_reciprocals(r, da):
+        return -r * da * r
 
-    def by_numpy(inverse):
-        a = np.asarray(inverse)
-        return HostMap(lambda dA: -a @ np.asarray(dA) @ a, lambda like, y: -a.T @ y @ a.T)
+    def by_numpy(r):
+        r = np.asarray(r)
+        return HostMap(lambda da: -r * np.asarray(da) * r, lambda like, y: -r * y * r)
 
     @jax.custom_jvp
-    def inverse_of(A):
-        return jnp.linalg.inv(A)
+    def reciprocals(a):
+        return 1 / a
 
-    @inverse_of.defjvp
-    def _inverse_of_jvp(primals, tangents):
-        inverse = inverse_of(*primals)
-        return inverse, linear_program(change_of_inverse, (), (inverse,), *tangents, inverse, by_numpy)
+    @reciprocals.defjvp
+    def _reciprocals_jvp(primals, tangents):
+        r = reciprocals(*primals)
+        return r, linear_program(change_of_reciprocals, (), (r,), *tangents, r, by_numpy)
 
 Forward mode calls the map, and reverse mode its transpose.
 """
