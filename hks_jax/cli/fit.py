@@ -23,12 +23,11 @@ import numpy as np
 
 from hks_jax import Grid, TensorField
 from hks_jax.cli import options
+from hks_jax.cli.combinations import refuse, require_one_metric
 from hks_jax.cli.computation import ComputationError, use_dtype
-from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.parsing import boundary_conditions, weight
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import require_one
 from hks_jax.domain import spd
 from hks_jax.fem.boundary import unreached_sides
 from hks_jax.io import ORDERS, read_tensors, save, save_tensors
@@ -167,7 +166,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
                 "Compute it by 'hks-jax hks' without --normalisation"
             )
         args.operator = args.operator or target.settings.get("operator", "laplace-beltrami")
-        require_one(args.metric, args.operator)
+        require_one_metric(args.metric, args.operator)
         if target.normalisation == "flat":
             target = replace(target, values=target.values / target.to_flat)
         # The mask is the domain of the computed signature, so all of its components belong to the domain.

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool
 
-from hks_jax.cli.options import refuse
+from hks_jax.cli.combinations import require_metric, require_reading_options
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.components import label_nodes
 from hks_jax.domain.tensor_checks import MetricChoice, OperatorChoice
@@ -61,6 +61,11 @@ class Reading:
         return cls(**{field.name: chosen[field.name] for field in fields(cls) if field.name in chosen})
 
     @property
+    def image(self) -> str:
+        """The suffix of images with results; empty for NumPy's files."""
+        return format_of(self.file).image
+
+    @property
     def second_scan(self) -> "Reading | None":
         """The second scan, if ``--noise`` names a file, or else None."""
         if self.noise is None or not is_file(self.noise):
@@ -91,31 +96,6 @@ def is_file(noise: str | None) -> bool:
     except ValueError:
         return True
     return False
-
-
-def require_metric(reading: Reading, volume: TensorVolume | None = None) -> None:
-    """Raise ValueError if the file has diffusion tensors and neither metric nor Fick's operator is chosen, or both.
-
-    Of NumPy's files, only those with lengths in mm have diffusion tensors, which `volume` shows after the file is read.
-    """
-    require_one(reading.metric, reading.operator)
-    if reading.operator == "fick" or reading.metric is not None:
-        return
-    if format_of(reading.file).image if volume is None else volume.length_unit:
-        raise ValueError(
-            "--metric: choose the metric of the diffusion tensors D: inverse (D⁻¹, in which points are near if "
-            "diffusion is fast), tensor (D itself) or adjugate (|D|D⁻¹); or pass --operator fick (diffusion by Fick's "
-            "law)"
-        )
-
-
-def require_one(metric: str | None, operator: str) -> None:
-    """Raise ValueError for a metric beside Fick's operator."""
-    if operator == "fick" and metric is not None:
-        raise ValueError(
-            f"--metric: got {metric} with --operator fick, whose metric is D⁻¹. Leave out --metric, or use "
-            "--operator laplace-beltrami"
-        )
 
 
 def read_volume(reading: Reading, progress: Progress) -> TensorVolume:
@@ -178,25 +158,9 @@ def sliced(volume: TensorVolume, axis: str, index: int) -> TensorVolume:
         raise ValueError(f"--slice: {error}") from error
 
 
-def _require_fitting_options(reading: Reading) -> None:
-    """Raise ValueError for options of tensors beside diffusion-weighted images, and for options of images without."""
-    if reading.bval is None and reading.bvec is None:
-        refuse(reading, ("b_max",), "this option is for diffusion-weighted images; pass --bval and --bvec too")
-        refuse(reading, ("bvec_frame",), "this option is for diffusion-weighted images; for tensors pass --frame")
-        return
-    if reading.others:
-        raise ValueError(
-            f"FILE: got {1 + len(reading.others)} files; expected one file of all images for --bval, --bvec"
-        )
-    if reading.bval is None or reading.bvec is None:
-        raise ValueError("--bval, --bvec: got one option; expected both for diffusion-weighted images")
-    refuse(reading, ("frame",), "this option is for files of tensors; pass --bvec-frame")
-    refuse(reading, ("order", "array", "spacing"), "this option is for files of tensors; leave it out with --bval")
-
-
 def _load(reading: Reading) -> tuple[TensorVolume, np.ndarray | None]:
     """Return the volume, and the mask of ``--mask`` unless the volume has this mask already."""
-    _require_fitting_options(reading)
+    require_reading_options(reading)
     if reading.bval is None or reading.bvec is None:
         spacing = reading.spacing[0] if reading.spacing is not None and len(reading.spacing) == 1 else reading.spacing
         files = [reading.file, *reading.others] if reading.others else reading.file
