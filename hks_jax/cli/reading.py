@@ -1,4 +1,4 @@
-"""Read the volume of tensors that the options for reading describe."""
+"""Read the volume of tensors that the options for reading describe, and its domain."""
 
 import argparse
 from collections.abc import Callable, Sequence
@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from hks_jax.cli.combinations import require_metric, require_reading_options
+from hks_jax.cli.computation import OfVolume, Settings, domain_of_volume
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.components import label_nodes
 from hks_jax.domain.tensor_checks import MetricChoice, OperatorChoice
@@ -109,6 +110,12 @@ def read_volume(reading: Reading, progress: Progress) -> TensorVolume:
         progress.note(outside_note(lost))
     require_valid(volume.with_mask(volume.grid(reading.components).mask), "--repair")
     return volume
+
+
+def read_grid(reading: Reading, settings: Settings, progress: Progress) -> OfVolume:
+    """Return the domain of the tensors that `read_volume` reads."""
+    volume = read_volume(reading, progress)
+    return domain_of_volume(volume, settings, reading.image)
 
 
 def without_element(volume: TensorVolume) -> Bool[np.ndarray, "*shape"]:

@@ -32,12 +32,12 @@ import numpy as np
 from hks_jax import SurfaceMesh, TensorField, gaussian_scale_space
 from hks_jax.cli import options
 from hks_jax.cli.combinations import require_grid_options, require_mesh_options
-from hks_jax.cli.computation import OfMesh, OfVolume, Settings, domain_of_volume
+from hks_jax.cli.computation import OfMesh, OfVolume, Settings
 from hks_jax.cli.meshes import MeshFile, read_domain
 from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.parsing import boundary_conditions
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import Reading, read_volume
+from hks_jax.cli.reading import Reading, read_grid
 from hks_jax.fem.boundary import unreached_sides
 from hks_jax.io import read_maps, save
 from hks_jax.io.cortex import MAPS
@@ -142,8 +142,7 @@ def _on_grid(args: argparse.Namespace, progress: Progress) -> OfVolume:
     require_grid_options(args)
     metric = None if args.operator == "fick" else "inverse"
     reading = Reading.of(args, file=args.tensors, metric=metric)
-    volume = read_volume(reading, progress)
-    domain = domain_of_volume(volume, Settings.of(args, metric=metric), reading.image)
+    domain = read_grid(reading, Settings.of(args, metric=metric), progress)
     for message in unreached_sides(domain.field.grid.inside, args.boundary):
         progress.warn(message)
     return domain

@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hks_jax.cli.combinations import Kind, require_fitting
-from hks_jax.cli.computation import OfMesh, OfVolume, Settings, Solved, domain_of_volume
+from hks_jax.cli.computation import OfMesh, OfVolume, Settings, Solved
 from hks_jax.cli.meshes import MeshFile, read_domain
 from hks_jax.cli.pairs import is_saved_pairs, read_pairs
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import Reading, read_volume
+from hks_jax.cli.reading import Reading, read_grid
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.io.mesh import is_mesh
 
@@ -38,8 +38,7 @@ def read_source(args: argparse.Namespace, progress: Progress, boundary: Boundary
     if kind == "pairs":
         saved = read_pairs(args.file, settings, progress)
         return Source(saved.domain, saved.settings, saved)
-    reading = Reading.of(args)
-    return Source(domain_of_volume(read_volume(reading, progress), settings, reading.image), settings)
+    return Source(read_grid(Reading.of(args), settings, progress), settings)
 
 
 def _kind_of(file: Path, others: list[Path]) -> Kind:

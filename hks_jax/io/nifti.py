@@ -158,7 +158,8 @@ def _own_record(image: Any, affine: np.ndarray) -> dict[str, Any]:
 
 def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolume:
     """Read tensors from a file; see `hks_jax.io.read_tensors`."""
-    return _tensors_of(name, *load(name), order, frame)
+    image, voxels = load(name)
+    return _tensors_of(name, image, voxels, order, frame)
 
 
 def _tensors_of(name: str, image: Any, voxels: np.ndarray, order: str | None, frame: str | None) -> TensorVolume:

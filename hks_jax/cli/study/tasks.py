@@ -13,14 +13,14 @@ import jax
 import numpy as np
 
 from hks_jax.cli.combinations import require_metric, require_noise_options
-from hks_jax.cli.computation import INPUT_ERRORS, ComputationError, Solved, compute_pairs, domain_of_volume
+from hks_jax.cli.computation import INPUT_ERRORS, ComputationError, Solved, compute_pairs
 from hks_jax.cli.inputs import require_inputs_kept
 from hks_jax.cli.noise import noise_of, signature_of
 from hks_jax.cli.outputs import Done, PictureError, draw_picture, show
 from hks_jax.cli.pairs import are_of, read_pairs, write_pairs
 from hks_jax.cli.parsing import Times
 from hks_jax.cli.progress import Progress, StudyProgress
-from hks_jax.cli.reading import Reading, is_file, read_volume
+from hks_jax.cli.reading import Reading, is_file, read_grid, read_volume
 from hks_jax.cli.stats import region_table
 from hks_jax.cli.study.folder import ABSENT, DONE, FAILED, MAP, PAIRS, REGIONS, UNFINISHED, Study
 from hks_jax.cli.study.group import other_units, write_group
@@ -270,9 +270,7 @@ def _pairs(study: Study, subject: Subject, progress: StudyProgress) -> Solved:
     if are_of(kept, fingerprint):
         return read_pairs(kept, study.settings, progress)
     kept.unlink(missing_ok=True)
-    reading = Reading.of(subject.args)
-    volume = read_volume(reading, progress)
-    domain = domain_of_volume(volume, study.settings, reading.image)
+    domain = read_grid(Reading.of(subject.args), study.settings, progress)
     solved = compute_pairs(domain, study.settings, progress, "other")
     if study.save_pairs:
         with progress.stage("writing"):
