@@ -32,8 +32,9 @@ from hks_jax.domain import spd
 from hks_jax.fem.boundary import unreached_sides
 from hks_jax.io import ORDERS, read_tensors, save, save_tensors
 from hks_jax.io.formats import format_of
+from hks_jax.io.json_files import tuples
 from hks_jax.io.repair import describe_invalid, invalid_in
-from hks_jax.io.result import Result, plain, tuples
+from hks_jax.io.result import Result
 from hks_jax.io.volume import TensorVolume, digest, require_position
 
 USAGE = "TARGET -o OUT"
@@ -224,7 +225,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         "losses_of_starts": list(fit.losses),
         "k": fit.problem.k,
         "parametrisation": args.parametrisation,
-        "settings": plain({name: getattr(args, name) for name in names}),
+        "settings": {name: getattr(args, name) for name in names},
     }
     return _write(args, fit, target, report, progress)
 

@@ -26,8 +26,9 @@ from hks_jax.cli.study.folder import ABSENT, DONE, FAILED, MAP, PAIRS, REGIONS, 
 from hks_jax.cli.study.group import other_units, write_group
 from hks_jax.cli.study.settings import open_study
 from hks_jax.cli.study.subjects import Subject
+from hks_jax.io.json_files import write_json
 from hks_jax.io.result import Result
-from hks_jax.io.tables import write_json, write_table
+from hks_jax.io.tables import write_table
 from hks_jax.io.volume import digest
 from hks_jax.plot import signature_panels
 from hks_jax.signatures.times import positive_range
