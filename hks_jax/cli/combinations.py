@@ -75,7 +75,7 @@ def require_mesh_options(args: argparse.Namespace) -> None:
 
 
 def require_grid_options(args: argparse.Namespace) -> None:
-    """Raise ValueError for options of meshes."""
+    """Raise ValueError for options that only meshes have."""
     refuse(args, ("clean", "inside"), "this option is for meshes; for tensors on a grid, see --repair and --mask")
 
 
