@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from hks_jax.cli import options
+from hks_jax.cli.combinations import refuse
 from hks_jax.cli.computation import Settings, domain_of_volume
-from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import Reading, read_volume

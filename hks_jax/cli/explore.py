@@ -16,7 +16,7 @@ import argparse
 from pathlib import Path
 
 from hks_jax.cli import options
-from hks_jax.cli.options import refuse
+from hks_jax.cli.combinations import refuse
 from hks_jax.cli.outputs import Done
 from hks_jax.cli.parsing import file_in_folder
 from hks_jax.cli.progress import Progress

@@ -23,18 +23,18 @@ import numpy as np
 
 from hks_jax import Grid, TensorField
 from hks_jax.cli import options
+from hks_jax.cli.combinations import refuse, require_one_metric
 from hks_jax.cli.computation import ComputationError, use_dtype
-from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.parsing import boundary_conditions, weight
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import require_one
 from hks_jax.domain import spd
 from hks_jax.fem.boundary import unreached_sides
 from hks_jax.io import ORDERS, read_tensors, save, save_tensors
 from hks_jax.io.formats import format_of
+from hks_jax.io.json_files import tuples
 from hks_jax.io.repair import describe_invalid, invalid_in
-from hks_jax.io.result import Result, plain, tuples
+from hks_jax.io.result import Result
 from hks_jax.io.volume import TensorVolume, digest, require_position
 
 USAGE = "TARGET -o OUT"
@@ -167,7 +167,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
                 "Compute it by 'hks-jax hks' without --normalisation"
             )
         args.operator = args.operator or target.settings.get("operator", "laplace-beltrami")
-        require_one(args.metric, args.operator)
+        require_one_metric(args.metric, args.operator)
         if target.normalisation == "flat":
             target = replace(target, values=target.values / target.to_flat)
         # The mask is the domain of the computed signature, so all of its components belong to the domain.
@@ -225,7 +225,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         "losses_of_starts": list(fit.losses),
         "k": fit.problem.k,
         "parametrisation": args.parametrisation,
-        "settings": plain({name: getattr(args, name) for name in names}),
+        "settings": {name: getattr(args, name) for name in names},
     }
     return _write(args, fit, target, report, progress)
 

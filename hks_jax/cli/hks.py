@@ -29,9 +29,9 @@ from pathlib import Path
 import numpy as np
 
 from hks_jax.cli import options
+from hks_jax.cli.combinations import refuse
 from hks_jax.cli.computation import compute_pairs
-from hks_jax.cli.noise import check_noise, noise_of, signature_of
-from hks_jax.cli.options import refuse
+from hks_jax.cli.noise import noise_of, signature_of
 from hks_jax.cli.outputs import PAIRS, REPORT, Done, of_earlier, write_outputs
 from hks_jax.cli.pairs import write_pairs
 from hks_jax.cli.parsing import voxel
@@ -83,9 +83,6 @@ def writes(args: argparse.Namespace) -> list[Path]:
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
-    check_noise(args)
-    if args.noise is None:
-        refuse(args, ("checkpoint",), "this option is for error bars; add --noise or leave it out")
     domain, settings, solved = read_source(args, progress)
     if isinstance(domain.place, TensorVolume) and domain.place.dimension == 2:
         refuse(args, ("through",), "this option is for a volume; leave it out for a slice")

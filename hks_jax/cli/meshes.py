@@ -14,12 +14,10 @@ from jaxtyping import Bool
 from scipy.spatial import cKDTree
 
 from hks_jax.cli.computation import Domain, Mesh, OfMesh, Settings, use_dtype
-from hks_jax.cli.options import add_reading, defaults, refuse
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import Reading, read, require_one
+from hks_jax.cli.reading import Reading, read
 from hks_jax.domain.simplices import WORDS, signed_measure
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
-from hks_jax.fem.problems import MESH_BOUNDARIES
 from hks_jax.io import TensorVolume, read_mask, sample_tensors
 from hks_jax.io.mesh import load_mesh
 from hks_jax.io.repair import require_valid
@@ -28,10 +26,6 @@ from hks_jax.io.tensor_order import Order, matrices
 from hks_jax.io.volume import digest
 from hks_jax.optional import optional
 from hks_jax.signatures.times import suitable_times
-
-OF_TENSORS = ("metric", "operator", "order", "interpolation")
-"""Options that refer to tensors of a mesh."""
-NO_NOISE = "this option needs tensors; saved eigenpairs and meshes with the Euclidean metric have none. Leave it out"
 
 
 class MeshFile(NamedTuple):
@@ -46,33 +40,9 @@ class MeshFile(NamedTuple):
 
     @classmethod
     def of(cls, args: argparse.Namespace, file: Path) -> "MeshFile":
-        """Return the options in `args`; raise ValueError for a boundary condition or options that meshes lack."""
-        of_grids = ["slice", "through", "view", "save_pairs", "components", "method"]
-        if not args.tensors:  # with --tensors, the options for reading refer to the volume
-            of_grids += [name for name in defaults(add_reading) if name not in ("order", "array")]
-        elif args.array:
-            raise ValueError("--tensors, --array: got both; expected tensors either in a volume or in the mesh's file")
-        refuse(args, of_grids, "this option is for tensors on a grid; leave it out for a mesh")
-        if args.boundary not in (None, *MESH_BOUNDARIES):
-            raise ValueError(f"--boundary: got {args.boundary!r}; expected {', '.join(MESH_BOUNDARIES)} for a mesh")
+        """Return the options in `args`."""
         around = Reading.of(args, file=args.tensors, others=()) if args.tensors else None
         return cls(file, args.clean, args.inside, args.array, args.order, around)
-
-
-def require_mesh_options(args: argparse.Namespace) -> None:
-    """Raise ValueError for several files, and for options of tensors without tensors or without --metric."""
-    if args.others:
-        raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one mesh")
-    if not (args.array or args.tensors):
-        why = "this option needs tensors, but without --array and --tensors a mesh has the Euclidean metric"
-        refuse(args, OF_TENSORS, f"{why}. Pass --array or --tensors, or leave this option out")
-        refuse(args, ("noise",), NO_NOISE)
-    elif args.metric is None and args.operator != "fick":
-        raise ValueError(
-            "--metric: the tensors of the mesh need a metric. Choose inverse, tensor or adjugate, or pass "
-            "--operator fick"
-        )
-    require_one(args.metric, args.operator)
 
 
 def read_domain(mesh_file: MeshFile, settings: Settings, progress: Progress) -> OfMesh:

@@ -41,9 +41,10 @@ from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.io import TensorVolume, read_maps, save
 from hks_jax.io.cortex import MAPS
 from hks_jax.io.formats import WRITTEN
+from hks_jax.io.json_files import write_json
 from hks_jax.io.mesh import WRITTEN as MESHES_WRITTEN
 from hks_jax.io.mesh import is_surface
-from hks_jax.io.tables import write_json, write_table
+from hks_jax.io.tables import write_table
 from hks_jax.signatures.modes import lengths_of
 
 USAGE = "FILE -o OUT"
@@ -150,14 +151,13 @@ def _tabulate(path: Path, columns: Mapping[str, np.ndarray]) -> None:
 
 
 def _sidecar(domain: OfVolume | OfMesh, unit: str, known: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Return the sidecar of the modes; an infinite length, of the eigenvalue 0, becomes null."""
-    lengths = {name: [x if np.isfinite(x) else None for x in known[name].tolist()] for name in ("wavelength", "fwhm")}
+    """Return the sidecar of the modes; the infinite lengths of the eigenvalue 0 will be null."""
     return {
         "Quantity": "modes",
         "Description": "Eigenfunctions, orthonormal in the inner product of the mass matrix, in ascending order",
-        "Eigenvalues": known["eigenvalue"].tolist(),
-        "Wavelengths": lengths["wavelength"],
-        "FWHM": lengths["fwhm"],
+        "Eigenvalues": known["eigenvalue"],
+        "Wavelengths": known["wavelength"],
+        "FWHM": known["fwhm"],
         "LengthUnits": unit or "of the coordinates",
         "Sources": [Path(domain.about["source"]).name] if domain.about.get("source") else [],
     }

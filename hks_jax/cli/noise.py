@@ -1,6 +1,5 @@
 """Error bars on the command line, from a chosen source of noise, and the signal-to-noise ratio of signatures."""
 
-import argparse
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import hks_jax as hj
-from hks_jax.checks import require_count
 from hks_jax.cli.computation import OfMesh, OfVolume, Solved, automatic_times, result_of, solver_of
 from hks_jax.cli.parsing import Times
 from hks_jax.cli.progress import Progress
@@ -19,7 +17,6 @@ from hks_jax.cli.reading import Reading, read_volume
 from hks_jax.io.result import Result
 from hks_jax.io.volume import require_position
 from hks_jax.signatures.times import FREE
-from hks_jax.uncertainty.propagate import LEAST
 
 _CANDIDATES = 4
 """The number of candidate times for each automatic time."""
@@ -40,14 +37,6 @@ class Noise(NamedTuple):
     of_tensors: hj.TensorNoise
     source: str
     draws: int
-
-
-def check_noise(args: argparse.Namespace) -> None:
-    """Raise ValueError if error bars are requested for a method other than ``"spectral"``, or with too few draws."""
-    if args.noise is not None:
-        require_count("--draws", args.draws, LEAST)
-        if args.method != "spectral":
-            raise ValueError(f"--noise: got --method {args.method}; expected spectral. Leave one of the options out")
 
 
 def signature_of(solved: Solved, noise: Noise | None, progress: Progress, checkpoint: Path | None = None) -> Result:

@@ -1,7 +1,7 @@
 """The options that several commands share, in groups: each function adds a group to a parser."""
 
 import argparse
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -380,8 +380,6 @@ _ARGUMENTS = {name: name for name in defaults(add_metric, add_reading, add_solvi
 _ARGUMENTS |= {"iterations": "erode", "level": "noise", "f": "map", "fwhm": "fwhm", "clean": "clean"}
 """The option that gives an argument of the library, by the argument's name in messages."""
 
-_USUAL = defaults(add_metric, add_reading, add_solving, add_meshes, add_signature, add_noise, add_view)
-
 
 def flag(name: str) -> str:
     """Return the flag of an option."""
@@ -391,11 +389,3 @@ def flag(name: str) -> str:
 def of_arguments(args: argparse.Namespace) -> dict[str, str]:
     """Return the flags of the options of a command that give arguments of the library, by the arguments' names."""
     return {name: flag(option) for name, option in _ARGUMENTS.items() if option in args}
-
-
-def refuse(args: Any, names: Iterable[str], why: str) -> None:
-    """Raise ValueError with the reason `why` if one of the named options is given; `args` may lack some of them."""
-    for name in names:
-        usual = _USUAL.get(name)
-        if (value := getattr(args, name, usual)) != usual and value is not False:
-            raise ValueError(f"{flag(name)}: {why}")

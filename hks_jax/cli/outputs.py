@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hks_jax.cli.progress import Progress
-from hks_jax.io.result import Result, plain
-from hks_jax.io.tables import write_json
+from hks_jax.io.json_files import plain, write_json
+from hks_jax.io.result import Result
 from hks_jax.storage import atomic_folder, atomic_path
 
 REPORT = "report.json"
@@ -70,8 +70,8 @@ def writing(
     with progress.stage("writing", str(folder)), atomic_folder(folder, replaced) as temporary:
         yield temporary, done
         seconds = {stage: round(spent, 3) for stage, spent in progress.timings.items()}
-        known = {"warnings": progress.warnings, "versions": versions(), "seconds": seconds}
-        summary |= plain({"command": sys.argv, **report, **known})
+        known = {"warnings": list(progress.warnings), "versions": versions(), "seconds": seconds}
+        summary |= {"command": sys.argv, **report, **known}
         write_json(temporary / REPORT, summary)
         done.files.extend(folder / file.name for file in temporary.iterdir())
     said = len(progress.warnings)

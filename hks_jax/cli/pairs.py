@@ -13,8 +13,8 @@ from hks_jax import assemble
 from hks_jax.cli.computation import Settings, Solved, domain_of_volume
 from hks_jax.cli.progress import Progress
 from hks_jax.io.arrays import place_of, volume_of
+from hks_jax.io.json_files import plain, tuples
 from hks_jax.io.pairs import pairs_of, save_pairs
-from hks_jax.io.result import plain, tuples
 from hks_jax.storage import load_npz
 
 _RECORD = "field_record"

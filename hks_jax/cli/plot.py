@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from hks_jax.cli import options
-from hks_jax.cli.options import refuse
+from hks_jax.cli.combinations import refuse
 from hks_jax.cli.outputs import Done
 from hks_jax.cli.parsing import axis_and_index, colour_range, file_in_folder, parse_times, point, quantiles, voxel
 from hks_jax.cli.progress import Progress

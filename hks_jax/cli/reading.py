@@ -1,4 +1,4 @@
-"""Read the volume of tensors that the options for reading describe."""
+"""Read the volume of tensors that the options for reading describe, and its domain."""
 
 import argparse
 from collections.abc import Callable, Sequence
@@ -9,7 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool
 
-from hks_jax.cli.options import refuse
+from hks_jax.cli.combinations import require_metric, require_reading_options
+from hks_jax.cli.computation import OfVolume, Settings, domain_of_volume
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.components import label_nodes
 from hks_jax.domain.tensor_checks import MetricChoice, OperatorChoice
@@ -61,6 +62,11 @@ class Reading:
         return cls(**{field.name: chosen[field.name] for field in fields(cls) if field.name in chosen})
 
     @property
+    def image(self) -> str:
+        """The suffix of images with results; empty for NumPy's files."""
+        return format_of(self.file).image
+
+    @property
     def second_scan(self) -> "Reading | None":
         """The second scan, if ``--noise`` names a file, or else None."""
         if self.noise is None or not is_file(self.noise):
@@ -93,31 +99,6 @@ def is_file(noise: str | None) -> bool:
     return False
 
 
-def require_metric(reading: Reading, volume: TensorVolume | None = None) -> None:
-    """Raise ValueError if the file has diffusion tensors and neither metric nor Fick's operator is chosen, or both.
-
-    Of NumPy's files, only those with lengths in mm have diffusion tensors, which `volume` shows after the file is read.
-    """
-    require_one(reading.metric, reading.operator)
-    if reading.operator == "fick" or reading.metric is not None:
-        return
-    if format_of(reading.file).image if volume is None else volume.length_unit:
-        raise ValueError(
-            "--metric: choose the metric of the diffusion tensors D: inverse (D⁻¹, in which points are near if "
-            "diffusion is fast), tensor (D itself) or adjugate (|D|D⁻¹); or pass --operator fick (diffusion by Fick's "
-            "law)"
-        )
-
-
-def require_one(metric: str | None, operator: str) -> None:
-    """Raise ValueError for a metric beside Fick's operator."""
-    if operator == "fick" and metric is not None:
-        raise ValueError(
-            f"--metric: got {metric} with --operator fick, whose metric is D⁻¹. Leave out --metric, or use "
-            "--operator laplace-beltrami"
-        )
-
-
 def read_volume(reading: Reading, progress: Progress) -> TensorVolume:
     """Read the tensors by `read`, and raise ValueError if they do not define a metric."""
     require_metric(reading)
@@ -129,6 +110,12 @@ def read_volume(reading: Reading, progress: Progress) -> TensorVolume:
         progress.note(outside_note(lost))
     require_valid(volume.with_mask(volume.grid(reading.components).mask), "--repair")
     return volume
+
+
+def read_grid(reading: Reading, settings: Settings, progress: Progress) -> OfVolume:
+    """Return the domain of the tensors that `read_volume` reads."""
+    volume = read_volume(reading, progress)
+    return domain_of_volume(volume, settings, reading.image)
 
 
 def without_element(volume: TensorVolume) -> Bool[np.ndarray, "*shape"]:
@@ -178,25 +165,9 @@ def sliced(volume: TensorVolume, axis: str, index: int) -> TensorVolume:
         raise ValueError(f"--slice: {error}") from error
 
 
-def _require_fitting_options(reading: Reading) -> None:
-    """Raise ValueError for options of tensors beside diffusion-weighted images, and for options of images without."""
-    if reading.bval is None and reading.bvec is None:
-        refuse(reading, ("b_max",), "this option is for diffusion-weighted images; pass --bval and --bvec too")
-        refuse(reading, ("bvec_frame",), "this option is for diffusion-weighted images; for tensors pass --frame")
-        return
-    if reading.others:
-        raise ValueError(
-            f"FILE: got {1 + len(reading.others)} files; expected one file of all images for --bval, --bvec"
-        )
-    if reading.bval is None or reading.bvec is None:
-        raise ValueError("--bval, --bvec: got one option; expected both for diffusion-weighted images")
-    refuse(reading, ("frame",), "this option is for files of tensors; pass --bvec-frame")
-    refuse(reading, ("order", "array", "spacing"), "this option is for files of tensors; leave it out with --bval")
-
-
 def _load(reading: Reading) -> tuple[TensorVolume, np.ndarray | None]:
     """Return the volume, and the mask of ``--mask`` unless the volume has this mask already."""
-    _require_fitting_options(reading)
+    require_reading_options(reading)
     if reading.bval is None or reading.bvec is None:
         spacing = reading.spacing[0] if reading.spacing is not None and len(reading.spacing) == 1 else reading.spacing
         files = [reading.file, *reading.others] if reading.others else reading.file

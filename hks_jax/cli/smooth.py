@@ -31,17 +31,17 @@ import numpy as np
 
 from hks_jax import SurfaceMesh, TensorField, gaussian_scale_space
 from hks_jax.cli import options
-from hks_jax.cli.computation import OfMesh, OfVolume, Settings, domain_of_volume
+from hks_jax.cli.combinations import require_grid_options, require_mesh_options
+from hks_jax.cli.computation import OfMesh, OfVolume, Settings
 from hks_jax.cli.meshes import MeshFile, read_domain
-from hks_jax.cli.options import refuse
 from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.parsing import boundary_conditions
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import Reading, read_volume
+from hks_jax.cli.reading import Reading, read_grid
 from hks_jax.fem.boundary import unreached_sides
 from hks_jax.io import read_maps, save
 from hks_jax.io.cortex import MAPS
-from hks_jax.io.formats import WRITTEN, format_of
+from hks_jax.io.formats import WRITTEN
 from hks_jax.io.mesh import WRITTEN as MESHES_WRITTEN
 from hks_jax.spectrum_free.smoothing import smooth
 
@@ -139,10 +139,10 @@ def _on_grid(args: argparse.Namespace, progress: Progress) -> OfVolume:
         raise ValueError(
             "--tensors: got no file; expected the diffusion tensors of the voxels, or the mesh of the maps"
         )
-    refuse(args, ("clean", "inside"), "this option is for meshes; for tensors on a grid, see --repair and --mask")
+    require_grid_options(args)
     metric = None if args.operator == "fick" else "inverse"
-    volume = read_volume(Reading.of(args, file=args.tensors, metric=metric), progress)
-    domain = domain_of_volume(volume, Settings.of(args, metric=metric), format_of(args.tensors).image)
+    reading = Reading.of(args, file=args.tensors, metric=metric)
+    domain = read_grid(reading, Settings.of(args, metric=metric), progress)
     for message in unreached_sides(domain.field.grid.inside, args.boundary):
         progress.warn(message)
     return domain
@@ -150,6 +150,7 @@ def _on_grid(args: argparse.Namespace, progress: Progress) -> OfVolume:
 
 def _on_mesh(args: argparse.Namespace, progress: Progress) -> OfMesh:
     metric = None if args.operator == "fick" else "inverse"
+    require_mesh_options(args)
     domain = read_domain(MeshFile.of(args, args.mesh), Settings.of(args, metric=metric), progress)
     about = domain.about | {"tensors": None if args.tensors is None else str(args.tensors)}
     return replace(domain, about=about)

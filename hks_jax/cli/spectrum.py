@@ -23,10 +23,10 @@ import numpy as np
 
 from hks_jax import Eigenpairs, TensorField
 from hks_jax.cli import options
-from hks_jax.cli.computation import Settings, compute_pairs, describe_pairs, domain_of_volume
+from hks_jax.cli.computation import Settings, compute_pairs, describe_pairs
 from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.progress import Progress
-from hks_jax.cli.reading import Reading, read_volume
+from hks_jax.cli.reading import Reading, read_grid
 from hks_jax.eigen.weyl import weyl_count
 
 USAGE = "FILE -o OUT"
@@ -48,9 +48,8 @@ def writes(args: argparse.Namespace) -> list[Path]:
 
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
-    volume = read_volume(Reading.of(args), progress)
     settings = Settings.of(args, boundary=args.boundary or "neumann")
-    domain = domain_of_volume(volume, settings)
+    domain = read_grid(Reading.of(args), settings, progress)
     solved = compute_pairs(domain, settings, progress)
     pairs = solved.pairs
     columns: dict[str, Any] = {

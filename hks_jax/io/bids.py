@@ -11,7 +11,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
-from hks_jax.io.tables import read_json, read_table
+from hks_jax.io.json_files import read_json
+from hks_jax.io.tables import read_table
 from hks_jax.io.tensor_order import Order
 
 CONTENT = ("model", "param", "desc", "label", "seg", "atlas", "fit", "bundles")

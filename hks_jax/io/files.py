@@ -17,9 +17,9 @@ from hks_jax.checks import require_number, require_real
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.io import mesh, nifti
 from hks_jax.io.formats import WRITTEN, format_of
+from hks_jax.io.json_files import write_json
 from hks_jax.io.masks import mask_on
 from hks_jax.io.repair import Repair, repair_tensors
-from hks_jax.io.tables import write_json
 from hks_jax.io.tensor_order import Frame, Order
 from hks_jax.io.units import Unit
 from hks_jax.io.volume import TensorVolume, describe, digest

@@ -18,9 +18,9 @@ from hks_jax.domain.simplices import WORDS, signed_measure
 from hks_jax.domain.simplicial_mesh import SimplicialMesh, SurfaceMesh, TetMesh
 from hks_jax.domain.triangulation import Triangulation
 from hks_jax.io import cortex
+from hks_jax.io.json_files import write_json
 from hks_jax.io.mesh_formats import Loaded, load_obj, load_off, polygonal, through_meshio
 from hks_jax.io.ply import load_ply
-from hks_jax.io.tables import write_json
 from hks_jax.io.vtk_image import by_time
 from hks_jax.naming import argument
 from hks_jax.optional import optional

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from hks_jax.accuracy import warn_of_accuracy
+from hks_jax.io.json_files import write_json
 from hks_jax.io.plausibility import undeclared_frame
 from hks_jax.io.repair import require_symmetric
-from hks_jax.io.tables import write_json
 from hks_jax.io.tensor_order import FRAMES, ORDERS, matrices, pack
 from hks_jax.io.units import UNITS, Unit, by_axis, in_mm2_per_s, unit_in
 from hks_jax.io.volume import AXES, Format, TensorVolume, corners, describe_tensors, images_of, own_record, placed
@@ -158,7 +158,8 @@ def _own_record(image: Any, affine: np.ndarray) -> dict[str, Any]:
 
 def read_tensors(name: str, order: str | None, frame: str | None) -> TensorVolume:
     """Read tensors from a file; see `hks_jax.io.read_tensors`."""
-    return _tensors_of(name, *load(name), order, frame)
+    image, voxels = load(name)
+    return _tensors_of(name, image, voxels, order, frame)
 
 
 def _tensors_of(name: str, image: Any, voxels: np.ndarray, order: str | None, frame: str | None) -> TensorVolume:

@@ -146,7 +146,7 @@ class Result:
         values = self.values.astype(np.float32) if single else self.values
         times = {"times": self.times} if self.times.size else {}
         extra = {**times, **({"eigenvalues": self.eigenvalues} if self.eigenvalues.size else {}), **self.arrays}
-        record = {**(origin or {}), "settings": plain(self.settings), **times}
+        record = {**(origin or {}), "settings": self.settings, **times}
         if self.times.size:
             lengths = None if self.lengths is None else self.lengths.tolist()
             record |= {"units": self.units, "lengths": lengths}
@@ -289,21 +289,3 @@ def signature_file(result: Path) -> Path:
         return result
     of_subject = [file for folder in ("", "*/") for file in result.glob(f"{folder}dwi/*_param-hks_dwimap.npz")]
     return of_subject[0] if len(of_subject) == 1 else result / "hks.npz"
-
-
-def tuples(value: Any) -> Any:
-    """Return a value from JSON with tuples in place of lists."""
-    return tuple(map(tuples, value)) if isinstance(value, list) else value
-
-
-def plain(value: Any) -> Any:
-    """Convert a value for JSON: NaN and infinity become None; tuples, paths and NumPy scalars become plain values."""
-    if isinstance(value, Mapping):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return str(value) if isinstance(value, Path) else value

@@ -1,12 +1,12 @@
 """Read and write tables as BIDS defines them: tab-separated, n/a for missing values, columns described in JSON."""
 
 import csv
-import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from hks_jax.io.json_files import write_json
 from hks_jax.storage import atomic_path, reading
 
 MISSING = "n/a"
@@ -33,23 +33,6 @@ def cell(value: Any) -> str:
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return MISSING
     return f"{value:.9g}" if isinstance(value, float) else " ".join(str(value).split()) or MISSING
-
-
-def write_json(path: Path, content: Mapping[str, Any]) -> Path:
-    """Write a JSON file atomically and return its path."""
-    with atomic_path(path) as temporary:
-        text = json.dumps(content, indent=2, ensure_ascii=False) + "\n"
-        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")  # file names may be invalid in UTF-8
-    return path
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Return the object in a JSON file, or an empty object if the file is missing, invalid or contains no object."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}
 
 
 def read_table(path: Path) -> list[dict[str, str]]:

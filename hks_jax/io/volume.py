@@ -17,6 +17,7 @@ from hks_jax.arrays import describe_array
 from hks_jax.checks import require_real
 from hks_jax.domain.components import as_mask
 from hks_jax.domain.grid import Grid, per_axis
+from hks_jax.io.json_files import plain
 from hks_jax.io.tensor_order import InvalidByOrder, Matrices, shear_notes, to_voxel_axes
 from hks_jax.uncertainty.noise import TensorNoise
 
@@ -310,9 +311,7 @@ def describe(volume: TensorVolume | None, more: Mapping[str, Any] | None) -> str
     if volume is not None:
         record |= {"source": volume.source, "sha256": volume.digest, "order": volume.order, "frame": volume.frame}
         record |= {"notes": list(volume.notes)}
-    return json.dumps(
-        {**record, **(more or {})}, default=lambda value: value.tolist() if hasattr(value, "tolist") else str(value)
-    )  # NRRD's header requires ASCII
+    return json.dumps(plain({**record, **(more or {})}), default=str)  # in ASCII, which NRRD's header requires
 
 
 def describe_tensors(volume: TensorVolume, order: str, frame: str, more: Mapping[str, Any] | None) -> str:

@@ -30,7 +30,8 @@ from hks_jax.inverse.search import OPTIMISERS
 from hks_jax.inverse.signature import pairs_for
 from hks_jax.inverse.unknowns import PARAMETRISATIONS
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
-from hks_jax.io.result import Result, tuples
+from hks_jax.io.json_files import tuples
+from hks_jax.io.result import Result
 from hks_jax.plot import signature
 
 SHAPE = (14, 12)

@@ -21,7 +21,7 @@ from dipy.segment.mask import median_otsu
 
 import hks_jax as hj
 from hks_jax.io import ORDERS, TensorVolume, atomic_folder, atomic_path, erode, find_example_brain, read_mask
-from hks_jax.io.result import tuples
+from hks_jax.io.json_files import tuples
 from hks_jax.io.tensor_order import pack, to_voxel_axes, unpack
 
 SHAPE = (4, 5, 6)

@@ -28,7 +28,7 @@ import argparse
 import copy
 from pathlib import Path
 
-from hks_jax.cli.options import refuse
+from hks_jax.cli.combinations import refuse
 from hks_jax.cli.parsing import folder
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.study import settings

@@ -18,10 +18,10 @@ from hks_jax.cli.parsing import Times
 from hks_jax.cli.reading import Reading, is_file
 from hks_jax.cli.study.subjects import Subject
 from hks_jax.io.formats import format_of
+from hks_jax.io.json_files import plain, read_json, write_json
 from hks_jax.io.masks import names_beside
 from hks_jax.io.nifti import SCALAR
-from hks_jax.io.result import Result, plain
-from hks_jax.io.tables import read_json, write_json
+from hks_jax.io.result import Result
 from hks_jax.io.volume import digest
 from hks_jax.storage import atomic_folder, atomic_path, existing
 
@@ -147,7 +147,7 @@ class Study:
             "Fingerprint": fingerprint,
             "SHA256": checksums,
         }
-        write_json(self.path(subject, f"{MAP}.json"), plain(sidecar))
+        write_json(self.path(subject, f"{MAP}.json"), sidecar)
 
     def forget(self, subject: Subject) -> None:
         """Remove files of a subject from an interrupted run or from a run with other settings."""

@@ -9,7 +9,8 @@ import numpy as np
 
 from hks_jax.cli.study.folder import FAILED, MAP, REGIONS, Study
 from hks_jax.cli.study.subjects import Subject
-from hks_jax.io.tables import read_json, read_table, write_table
+from hks_jax.io.json_files import read_json
+from hks_jax.io.tables import read_table, write_table
 from hks_jax.io.units import LIVING_TISSUE
 
 _COLUMNS = {"sub": "participant_id", "ses": "session_id"}

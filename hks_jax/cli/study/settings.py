@@ -20,8 +20,7 @@ from hks_jax.cli.study.folder import DESCRIPTIONS, Study, reading_options
 from hks_jax.cli.study.subjects import Subject
 from hks_jax.io import TensorVolume
 from hks_jax.io.bids import are_entities
-from hks_jax.io.result import tuples
-from hks_jax.io.tables import read_json
+from hks_jax.io.json_files import read_json, tuples
 from hks_jax.signatures.spans import SHORTEST
 from hks_jax.signatures.times import LAST
 

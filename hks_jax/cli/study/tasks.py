@@ -12,22 +12,23 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from hks_jax.cli.computation import INPUT_ERRORS, ComputationError, Solved, compute_pairs, domain_of_volume
+from hks_jax.cli.combinations import require_metric, require_noise_options
+from hks_jax.cli.computation import INPUT_ERRORS, ComputationError, Solved, compute_pairs
 from hks_jax.cli.inputs import require_inputs_kept
-from hks_jax.cli.noise import check_noise, noise_of, signature_of
+from hks_jax.cli.noise import noise_of, signature_of
 from hks_jax.cli.outputs import Done, PictureError, draw_picture, show
 from hks_jax.cli.pairs import are_of, read_pairs, write_pairs
 from hks_jax.cli.parsing import Times
 from hks_jax.cli.progress import Progress, StudyProgress
-from hks_jax.cli.reading import Reading, is_file, read_volume, require_metric
+from hks_jax.cli.reading import Reading, is_file, read_grid, read_volume
 from hks_jax.cli.stats import region_table
 from hks_jax.cli.study.folder import ABSENT, DONE, FAILED, MAP, PAIRS, REGIONS, UNFINISHED, Study
 from hks_jax.cli.study.group import other_units, write_group
 from hks_jax.cli.study.settings import open_study
 from hks_jax.cli.study.subjects import Subject
-from hks_jax.io.formats import format_of
+from hks_jax.io.json_files import write_json
 from hks_jax.io.result import Result
-from hks_jax.io.tables import write_json, write_table
+from hks_jax.io.tables import write_table
 from hks_jax.io.volume import digest
 from hks_jax.plot import signature_panels
 from hks_jax.signatures.times import positive_range
@@ -67,7 +68,7 @@ def run_study(
             files = write_group(study, chosen, problems)
     done = [subject for subject in chosen if subject.name not in problems]
     failed = [subject.name for subject in chosen if subject.name in problems]
-    files += [study.path(subject, f"{MAP}{format_of(subject.args.file).image or '.npz'}") for subject in done]
+    files += [study.path(subject, f"{MAP}{Reading.of(subject.args).image or '.npz'}") for subject in done]
     shown = [str(file) for file in files if not collects or file.suffix == ".tsv"]
     show(args, Done(files, {"failed": failed}, "\n".join(shown)))
     if failed:
@@ -118,7 +119,7 @@ def _begin(
         if subject.arguments is not None:
             require_inputs_kept(subject.arguments)
             require_metric(Reading.of(subject.arguments))
-            check_noise(subject.arguments)
+            require_noise_options(subject.arguments)
     progress = StudyProgress(len(chosen), args.quiet)
     progress.start = begun.start
     progress.end(note)
@@ -270,8 +271,7 @@ def _pairs(study: Study, subject: Subject, progress: StudyProgress) -> Solved:
     if are_of(kept, fingerprint):
         return read_pairs(kept, study.settings, progress)
     kept.unlink(missing_ok=True)
-    volume = read_volume(Reading.of(subject.args), progress)
-    domain = domain_of_volume(volume, study.settings, format_of(subject.args.file).image)
+    domain = read_grid(Reading.of(subject.args), study.settings, progress)
     solved = compute_pairs(domain, study.settings, progress, "other")
     if study.save_pairs:
         with progress.stage("writing"):
