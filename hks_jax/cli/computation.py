@@ -249,7 +249,7 @@ def solver_of(
         solver = (choose_for_one if followers == "none" else choose_for_similar)(pencil, k)
     if isinstance(solver, hj.ChebyshevFilter):
         return replace(solver, tolerance=_TOLERANCE, keep_spare=followers == "similar")
-    return solver if isinstance(solver, hj.ShiftInvert) else settings.solver
+    return solver if followers == "none" and isinstance(solver, hj.ShiftInvert) else settings.solver
 
 
 def compute_pairs(

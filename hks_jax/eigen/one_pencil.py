@@ -62,7 +62,7 @@ def pairs_of_pencil(
 
 
 def _able(solver: Eigensolver, pencil: Pencil, k: int, extra: int) -> Eigensolver:
-    """Return the solver or, if it cannot compute so many pairs of a K that may be indefinite, the dense one."""
+    """Return the solver, or the dense one if the solver cannot compute k pairs and K may be indefinite."""
     n_dof, most = pencil.size, solver.max_pairs(pencil.size)
     if k + extra <= most:
         return solver

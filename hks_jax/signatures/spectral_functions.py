@@ -105,7 +105,7 @@ def _weighted(contraction: Contraction, weights: Float[Array, "m k"], vectors: F
 # kept, f is set to zero on all others, and the entries of F between kept pairs do not change. The entries of F between
 # a kept pair i and a pair j that is not kept are f(λᵢ) (Gᵢⱼ − λᵢHᵢⱼ)/(λᵢ − λⱼ).
 #
-# Only k of the n pairs are known, some of which may not be kept. `mixing` and `changes_between` give the entries of F
+# Only k of the n pairs are known, and a signature may keep fewer. `mixing` and `changes_between` give the entries of F
 # between the k known pairs. The entries of F between a kept pair i and the unknown pairs add to the differential
 #
 #     Σᵢ f(λᵢ) (φᵢxᵢᵀ + xᵢφᵢᵀ),    xᵢ = (I − ΦΦᵀM) dφᵢ,
