@@ -16,7 +16,7 @@ from hks_jax.cli.options import add_metric, add_signature, add_solving, defaults
 from hks_jax.cli.parsing import Times, parse_times
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.tensor_checks import Interpolation, MetricChoice, OperatorChoice
-from hks_jax.eigen.automatic import choose_for_one, choose_for_similar, choose_solvers
+from hks_jax.eigen.automatic import choose_solvers
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.boundary import BoundarySpec, default_boundary, unreached_sides
 from hks_jax.io import TensorVolume
@@ -26,10 +26,6 @@ from hks_jax.signatures.hks import Normalisation
 from hks_jax.signatures.rim import estimate_of, free_share, influence_of, is_estimated, is_known, rim_of
 from hks_jax.signatures.spans import SHORTEST, resolved_span
 from hks_jax.signatures.times import FREE, RESOLVED, default_k, times_of
-
-Followers: TypeAlias = Literal["none", "other", "similar"]
-"""The computations that follow in a process: none, those of other domains, or those of similar ones, which start from
-the first eigenpairs."""
 
 EARLY = 0.02
 """The truncated share of the signature above which the boundary's influence is estimated without eigenpairs."""
@@ -236,24 +232,20 @@ def domain_of_volume(volume: TensorVolume, settings: Settings, image: str = "") 
 
 
 def solver_of(
-    settings: Settings, pencil: hj.Pencil | hj.MirrorPencil, k: int, followers: Followers
+    settings: Settings, pencil: hj.Pencil | hj.MirrorPencil, k: int, keep_spare: bool = False
 ) -> str | hj.Eigensolver:
-    """Return the solver. Without ``followers``, the choice of "auto" is the solver with the shortest first call.
+    """Return the solver: its name, because the two problems of "mean" may get different solvers, or a Chebyshev filter.
 
-    The two problems of "mean" may get different solvers by name, so most names are handed on. The Chebyshev filter gets
-    the tolerance of the command line and, for similar domains, keeps what later computations start from.
+    The filter has the tolerance of the command line. With ``keep_spare`` it keeps what later computations start from.
     """
-    if settings.solver != "auto" or followers == "other":
-        solver = choose_solvers(settings.solver, pencil, k)[0][0]
-    else:
-        solver = (choose_for_one if followers == "none" else choose_for_similar)(pencil, k)
+    solver = choose_solvers(settings.solver, pencil, k)[0][0]
     if isinstance(solver, hj.ChebyshevFilter):
-        return replace(solver, tolerance=_TOLERANCE, keep_spare=followers == "similar")
-    return solver if followers == "none" and isinstance(solver, hj.ShiftInvert) else settings.solver
+        return replace(solver, tolerance=_TOLERANCE, keep_spare=keep_spare)
+    return settings.solver
 
 
 def compute_pairs(
-    domain: OfVolume | OfMesh, settings: Settings, progress: Progress, followers: Followers = "none"
+    domain: OfVolume | OfMesh, settings: Settings, progress: Progress, keep_spare: bool = False
 ) -> Solved:
     """Compute the eigenpairs of a domain; raise ComputationError unless all converge."""
     boundary, field = settings.boundary, domain.field
@@ -273,7 +265,7 @@ def compute_pairs(
     assert dimension is not None
     k = default_k(dimension, unknowns) if settings.k is None else settings.k
     _tell_of_resolution(k, pencil, domain, settings, progress)
-    solver = solver_of(settings, pencil, k, followers)
+    solver = solver_of(settings, pencil, k, keep_spare)
     with progress.stage("eigenpairs", f"{k} of {unknowns} by {choose_solvers(solver, pencil, k)[0][0].name}"):
         pairs = hj.eigenpairs(pencil, k, solver=solver, progress=progress.update)
         jax.block_until_ready(pairs.eigenvalues)

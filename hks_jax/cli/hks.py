@@ -87,7 +87,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     if isinstance(domain.place, TensorVolume) and domain.place.dimension == 2:
         refuse(args, ("through",), "this option is for a volume; leave it out for a slice")
     noise = noise_of(domain, Reading.of(args), args.draws, progress)  # before the eigenpairs, because it may fail
-    solved = solved or compute_pairs(domain, settings, progress, "none" if noise is None else "similar")
+    solved = solved or compute_pairs(domain, settings, progress, keep_spare=noise is not None)
     kept = [args.output / PAIRS] * args.save_pairs
     for path in kept:  # the eigenpairs are written first, because later steps may fail
         with progress.stage("writing", str(path)):

@@ -138,7 +138,7 @@ def _error_bars(
     of_tensors, wanted = domain.of_tensors, settings.times.automatic
     times = settings.times.explicit or automatic_times(pairs, _CANDIDATES * wanted)
     maps: list[np.ndarray] = []
-    solver = solver_of(settings, pairs.pencil, pairs.k, "similar")
+    solver = solver_of(settings, pairs.pencil, pairs.k, keep_spare=True)
     starts, start = isinstance(solver, hj.ChebyshevFilter), pairs
 
     def signature(D: Any) -> Any:

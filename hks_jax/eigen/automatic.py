@@ -22,22 +22,19 @@ _SMALL = 1500
 """The largest number n of unknowns for which the dense solver, which takes O(n³) time, is chosen."""
 
 # The choice is between shift-invert and a solver in JAX, called ``ours``: the Chebyshev filter on grids in 3D or in
-# float32, otherwise block Lanczos. A solver in JAX takes about five seconds to compile at any size. So for n·k up to 5
-# million, one solver is the fastest in the first call, and another solver in later calls. For each solver,
+# float32, otherwise block Lanczos. A solver in JAX takes many seconds to compile at any size. So up to a certain n·k,
+# shift-invert is the fastest in the first call, and the other solver in later calls. For each solver,
 # benchmarks/first_answer/automatic.py divides the time of its first call by the shortest first call of all solvers, and
-# likewise for later calls. The choice minimises the larger of the two ratios, except for small volumes in float32. In
-# float32, block Lanczos also factorises in float32; so it searches repeatedly, and leaves some pairs unconverged.
-_LARGE, _LARGE_IN_SINGLE = 800_000, 5_000_000
-"""The least n·k (unknowns times pairs) for which a solver in JAX is chosen: in general, and for 2D grids in float32."""
-_LARGE_FOR_ONE = 3_000_000
-"""The least n·k for which block Lanczos has the shortest first call in float64 on 2D grids and on surfaces."""
+# likewise for later calls. The choice minimises the larger of the two ratios.
+_LARGE = {2: 8_000_000, 3: 800_000}
+"""The least n·k (unknowns times pairs) for which a solver in JAX is chosen, for each dimension; 2 stands for None."""
 
 
 def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensolver:
     """Return the solver with the given name.
 
-    ``"auto"`` chooses by the pencil's size, k and dtype. On an accelerator or for traced values (`jax.jit`,
-    `jax.vmap`), ``"auto"`` never chooses shift-invert, because shift-invert runs on the host.
+    ``"auto"`` chooses by the pencil's size, k and dtype. On accelerators, and under `jax.jit` with several devices,
+    ``"auto"`` never chooses shift-invert, because shift-invert runs on the host.
 
     Raises:
         ValueError: the name is unknown.
@@ -68,32 +65,24 @@ def choose_solvers(solver: str | Eigensolver, pencil: AnyPencil, k: int) -> list
     return solvers
 
 
-def choose_for_similar(pencil: AnyPencil, k: int) -> Eigensolver:
-    """Return the solver that ``"auto"`` chooses for the first of many similar pencils: never a solver on the host."""
-    part, share = pencil.parts[0], -(-k // len(pencil.parts))
-    return Dense() if _is_small(part, share) else _in_jax(part, share)
-
-
-def choose_for_one(pencil: AnyPencil, k: int) -> Eigensolver:
-    """Return the solver with the shortest first call, for a process that computes the eigenpairs of one domain."""
-    part, share = pencil.parts[0], -(-k // len(pencil.parts))
-    usual, matrices = choose_solver("auto", part, share), (part.stiffness, part.mass)
-    planar = isinstance(usual, BlockLanczos) and part.space.dimension != 3 and is_concrete_on_cpu(matrices)
-    return ShiftInvert() if planar and part.space.n_dof * share < _LARGE_FOR_ONE else usual
-
-
 def choose_for_fit(pencil: AnyPencil, k: int) -> Eigensolver:
-    """Return the solver that ``"auto"`` chooses in a fit.
+    """Return the solver that ``"auto"`` chooses in a fit, where values are traced.
 
-    A fit multiplies many vectors by every Jacobian. The linear solver of block Lanczos reuses its factorisations in all
-    products with one Jacobian. Values are traced in a fit, so the solver must not run on the host.
+    A fit multiplies many vectors by every Jacobian, so the linear solver of derivatives is one that reuses its
+    factorisations in all products with one Jacobian.
     """
-    n, fitting = pencil.space.n_dof, BlockLanczos(adjoint=FactorisedAdjoint(1e-5, solves=20))
-    return fitting if n > _SMALL and k + 20 <= fitting.max_pairs(n) else Dense()
+    n, adjoint = pencil.space.n_dof, FactorisedAdjoint(1e-5, solves=20)
+    if n <= _SMALL or k + 20 > BlockLanczos().max_pairs(n):
+        return Dense()
+    return (ShiftInvert if _host_called(n, k, pencil.space.dimension) else BlockLanczos)(adjoint=adjoint)
 
 
-def _is_small(pencil: Pencil, k: int) -> bool:
-    return pencil.space.n_dof <= max(_SMALL, 4 * k - 1)
+def _host_called(n: int, k: int, dimension: int | None) -> bool:
+    """Return whether a program under `jax.jit` calls the host for eigenpairs.
+
+    With several devices, XLA might call the host on each of them.
+    """
+    return n * k < _LARGE[dimension or 2] and jax.default_backend() == "cpu" and jax.device_count() == 1
 
 
 def _in_jax(pencil: Pencil, k: int) -> Eigensolver:
@@ -107,16 +96,13 @@ def _in_jax(pencil: Pencil, k: int) -> Eigensolver:
 
 
 def _automatic(pencil: Pencil, k: int) -> Eigensolver:
-    n, volume = pencil.space.n_dof, pencil.space.dimension == 3
-    if _is_small(pencil, k):
+    n, dimension = pencil.space.n_dof, pencil.space.dimension
+    if n <= max(_SMALL, 4 * k - 1):
         return Dense()
-    exact, laplacian = pencil.stiffness.dtype == np.float64, pencil.measured and pencil.bounded
-    ours = _in_jax(pencil, k)
-    if not is_concrete_on_cpu(jax.lax.stop_gradient((pencil.stiffness, pencil.mass))):
-        return ours
-    if not laplacian:
-        return ShiftInvert() if n * k < _LARGE else ours
-    # Shift-invert computes in float64, also for float32 matrices.
-    suited = ChebyshevFilter if volume or not exact else BlockLanczos
-    large = _LARGE if exact or volume else _LARGE_IN_SINGLE
-    return ours if isinstance(ours, suited) and n * k >= large else ShiftInvert()
+    if is_concrete_on_cpu(jax.lax.stop_gradient((pencil.stiffness, pencil.mass))):
+        return ShiftInvert() if n * k < _LARGE[dimension or 2] else _in_jax(pencil, k)
+    if not (_host_called(n, k, dimension) and pencil.bounded):  # under `jit`, a second solver cannot follow
+        return _in_jax(pencil, k)
+    # In later calls, derivatives in JAX are twice as fast as on the host; in 3D and in float32, they are not.
+    exact = pencil.stiffness.dtype == np.float64
+    return ShiftInvert(adjoint=FactorisedAdjoint()) if exact and dimension != 3 else ShiftInvert()

@@ -37,16 +37,26 @@ def factorise_stably_on_host(matrix: csc_matrix) -> SuperLU:
     return splu(matrix.tocsc())
 
 
-def inertia_on_host(K: csc_matrix, M: csc_matrix, shift: float) -> tuple[int, bool]:
-    """Return the number of eigenvalues below σ, by the inertia of K − σM, and whether a test confirms it."""
+def inertia(K: csc_matrix, M: csc_matrix, shift: float) -> tuple[SuperLU | None, int, float]:
+    """Return a factorisation of K − σM, its number of negative pivots, and its error, measured by random solves.
+
+    The number is that of eigenvalues below σ if the error is less than `CONTRACTION`. If K − σM is singular or needs
+    pivoting, the error is infinite.
+    """
     matrix = (K - shift * M).tocsc()
     try:
         factor = factorise_on_host(matrix)
     except RuntimeError:  # exactly singular
-        return 0, False
+        return None, 0, np.inf
     # If SuperLU exchanges rows, the pivots' signs are not the inertia.
-    sound = _contraction(matrix, factor) < CONTRACTION and bool((factor.perm_r == factor.perm_c).all())
-    return int((factor.U.diagonal() < 0).sum()), sound
+    exchanged = (factor.perm_r != factor.perm_c).any()
+    return factor, int((factor.U.diagonal() < 0).sum()), np.inf if exchanged else _contraction(matrix, factor)
+
+
+def inertia_on_host(K: csc_matrix, M: csc_matrix, shift: float) -> tuple[int, bool]:
+    """Return the number of eigenvalues below σ, by the inertia of K − σM, and whether a test confirms it."""
+    _, negative, error = inertia(K, M, shift)
+    return negative, error < CONTRACTION
 
 
 def _contraction(matrix: csc_matrix, factor: SuperLU) -> float:

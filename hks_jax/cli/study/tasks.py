@@ -272,7 +272,7 @@ def _pairs(study: Study, subject: Subject, progress: StudyProgress) -> Solved:
         return read_pairs(kept, study.settings, progress)
     kept.unlink(missing_ok=True)
     domain = read_grid(Reading.of(subject.args), study.settings, progress)
-    solved = compute_pairs(domain, study.settings, progress, "other")
+    solved = compute_pairs(domain, study.settings, progress)
     if study.save_pairs:
         with progress.stage("writing"):
             write_pairs(kept, solved, progress.warnings, fingerprint)

@@ -1,7 +1,7 @@
-"""Eigenpairs of large sparse pencils by SciPy's shift-invert Lanczos, on the host."""
+"""Eigenpairs of sparse pencils by shift-invert block Lanczos on the host."""
 
 import time
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,39 +9,50 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from scipy.sparse import csc_matrix
-from scipy.sparse.linalg import ArpackError, ArpackNoConvergence, LinearOperator, eigsh
+from scipy.sparse.linalg import SuperLU
 from threadpoolctl import threadpool_limits
 
 from hks_jax.checks import require_count
 from hks_jax.eigen.adjoints.complement import Adjoint
 from hks_jax.eigen.quality import largest_of
 from hks_jax.eigen.shift_invert.host_adjoint import HostAdjoint
+from hks_jax.eigen.shift_invert.host_lanczos import nearest
 from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, Status, is_remote, silent
+from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.pencil import Pencil
-from hks_jax.linear.host_matrices import factorise_on_host, host_matrices, inertia_on_host
+from hks_jax.linear.host_matrices import factorise_on_host, host_matrices, inertia, inertia_on_host
 from hks_jax.traced import is_traced
 
 HostPairs = tuple[np.ndarray, np.ndarray, float]
 
-_ROUNDS = 20
-"""The maximal number of ARPACK runs. Each run of ARPACK after the first searches for missed eigenvalues."""
+_BLOCK, _MANY = 4, 200
+"""The number of vectors per block for few pairs, and the number of pairs from which on blocks are twice as wide."""
 _BESIDE = 1e-6
 """The distance of a count of eigenvalues below the last computed one, relative to the range of the computed ones."""
 _TOLD = 25
-"""The number of solves between two reports."""
+"""The least number of solves between two reports."""
+_FEW = 12
+"""The largest number of eigenvalues for which a shift below the spectrum is as fast as one within."""
+_TRIES = 3
+"""The maximal number of shifts that are tried within the spectrum."""
+_POOR = 1e-9
+"""The relative residual up to which eigenvectors need no further solve."""
+_ACCURATE = 1e-8
+"""The largest error of a factorisation within the spectrum."""
 
 
 class ShiftInvert(Eigensolver[Pencil]):
-    """ARPACK's Lanczos (`scipy.sparse.linalg.eigsh`) on (K + sM)⁻¹M for some s > 0, by SuperLU in float64 on the host.
+    """Block Lanczos on (K − σM)⁻¹M with SuperLU's factorisation, in float64 on the host, without compilation.
 
-    The inertia of a second factorisation checks that no eigenvalue was missed. Under `jit` and `vmap`, the solver runs
-    in a host callback, one problem at a time. Outside `jit`, it can be interrupted, and reports progress.
+    The shift σ is about half of the k-th eigenvalue, or below the spectrum if no such shift is found. The inertia of a
+    second factorisation checks that no eigenvalue was missed. Under `jit` and `vmap`, the solver runs in a host
+    callback, one problem at a time. Outside `jit`, it can be interrupted, and reports progress.
 
     Attributes:
-        tolerance: the relative residual at which a pair counts as converged; ARPACK itself runs to machine precision.
-        max_restarts: the maximal number of implicit restarts.
-        basis: the number of vectors in the Lanczos basis; None means 5k/4 + 20. The solver enlarges a basis that does
-            not exceed the number of computed pairs, which for derivatives includes guard pairs.
+        tolerance: the relative residual at which a pair counts as converged; Lanczos itself runs until 1e-12.
+        max_restarts: the maximal number of searches after the first: for missing copies of multiple eigenvalues, and
+            for further pairs if the basis is full.
+        basis: the maximal number of vectors in the Lanczos basis. None means 6k + 160, of which about 2k are used.
 
     Examples:
         >>> sparse = hj.eigenpairs(field, k=12, solver=hj.ShiftInvert(basis=30))
@@ -52,12 +63,12 @@ class ShiftInvert(Eigensolver[Pencil]):
     name: ClassVar[str] = "shift-invert"
     in_double: ClassVar[bool] = True
     tolerance: float = eqx.field(default=1e-8, static=True)
-    max_restarts: int = eqx.field(default=300, static=True)
+    max_restarts: int = eqx.field(default=20, static=True)
     basis: int | None = eqx.field(default=None, static=True)
     adjoint: Adjoint = eqx.field(default=HostAdjoint(), static=True, kw_only=True)
 
     def max_pairs(self, n_dof: int) -> int:
-        """Return n_dof − 1, because a Lanczos basis must have more than k vectors."""
+        """Return n_dof − 1: with all pairs, no eigenvalue would be left for the certificate."""
         return n_dof - 1
 
     def __check_init__(self) -> None:
@@ -77,20 +88,16 @@ class ShiftInvert(Eigensolver[Pencil]):
             if not null_space_known:
                 origin = _lower_bound(K, M) if np.isnan(origin) else origin
                 K = K - origin * M
-            # K + sM is positive definite for any shift s > 0. The shift is small relative to the lowest positive
-            # eigenvalue by Weyl's law or, if that is unknown, relative to the median of Kᵢᵢ/Mᵢᵢ.
-            if dimension is None or not np.isfinite(volume):
-                shift = 1e-3 * float(np.median(K.diagonal() / M.diagonal()))
-            else:
-                shift = 0.1 * (2 * np.pi) ** 2 / float(np.asarray(volume)) ** (2 / dimension)
-            # More BLAS threads hardly accelerate ARPACK's products with its basis, and slow them down on busy cores.
+            scales = _scales(K, M, k, dimension, float(np.asarray(volume)))
+            # More BLAS threads hardly accelerate products with the basis, and slow them down on busy cores.
             with threadpool_limits(1, user_api="blas"):
-                values, vectors, bound = self._lanczos(K, M, k, shift, report)
+                values, vectors, bound = self._searched(K, M, k, scales, report)
                 if not null_space_known and is_remote(values, _rounding(K, M)):
                     spread = values[-1] - values[0]
                     nearer = values[0] - spread
                     origin, K = origin + nearer, K - nearer * M
-                    values, vectors, bound = self._lanczos(K, M, k, spread, report)
+                    scales = scales._replace(below=spread, within=1.5 * spread)
+                    values, vectors, bound = self._searched(K, M, k, scales, report)
             return tuple(np.asarray(result, dtype) for result in (values + origin, vectors, bound + origin))
 
         inputs = (lowest, jnp.inf if pencil.volume is None else pencil.volume, *data)
@@ -99,58 +106,49 @@ class ShiftInvert(Eigensolver[Pencil]):
             return jax.pure_callback(solve, shapes, *inputs, vmap_method="sequential")
         return jax.device_put(solve(*inputs))  # `asarray` would return NumPy arrays while JAX differentiates
 
-    def _lanczos(self, K: csc_matrix, M: csc_matrix, k: int, shift: float, report: Report) -> HostPairs:
+    def _searched(self, K: csc_matrix, M: csc_matrix, k: int, scales: "_Scales", report: Report) -> HostPairs:
         n = K.shape[0]
-        nothing = np.full(k, np.nan), np.full((k, n), np.nan), np.nan
-        if not (np.isfinite(K.data).all() and np.isfinite(M.data).all()):
-            return nothing
-        report("factorising")
-        begun = time.perf_counter()
-        rounding = _rounding(K, M)
-        factor = factorise_on_host(K + shift * M)
-        factorised = time.perf_counter()
         values, vectors = np.empty(0), np.empty((n, 0))
-        solves = before = 0
-        wanted, basis = k, 1
+        if not (np.isfinite(K.data).all() and np.isfinite(M.data).all()):
+            return _padded(values, vectors, k, np.nan)
+        report("factorising")
+        begun, solves, told = time.perf_counter(), 0, 0
+        rounding, mass = _rounding(K, M), M.tocsr()
+        shift, factor = _shifted(K, M, k, scales)
+        factorised = time.perf_counter()
+        block = _BLOCK if k < _MANY else 2 * _BLOCK
+        usual = int(1.75 * k + 13 * block) if shift > 0 else int(2.3 * k + 16 * block)
+        missing = k
 
-        def apply_inverse(x: np.ndarray) -> np.ndarray:
-            nonlocal solves
-            solves += 1
-            if solves % _TOLD == 0:
-                to_come = expected_solves(solves - before, basis, wanted) - (solves - before)
-                of_each = (time.perf_counter() - factorised) / solves
+        def inverse(x: np.ndarray) -> np.ndarray:
+            nonlocal solves, told
+            if solves // _TOLD > told:
+                told = solves // _TOLD
+                expected = max(usual, solves + 2 * block)
                 # The final count of eigenvalues takes another factorisation.
-                left = to_come * of_each + factorised - begun
-                report(Status(f"{solves} of about {solves + to_come} solves", left))
-            y = factor.solve(x)
-            return y - vectors @ (vectors.T @ (M @ y))
+                left = (expected - solves) * (time.perf_counter() - factorised) / solves + factorised - begun
+                report(Status(f"{solves} of about {expected} solves", left))
+            solves += x.shape[1]
+            return factor.solve(x)
 
-        inverse = LinearOperator(K.shape, matvec=apply_inverse, dtype=np.float64)
-        for seed in range(_ROUNDS):
-            start = np.random.default_rng(seed).standard_normal(n)
-            least, before = max(wanted + 1, self.basis or wanted + wanted // 4 + 20), solves
-            for basis in (min(n, size * least) for size in (1, 2, 4)):
-                try:
-                    further, others = eigsh(
-                        K, wanted, M, -shift, OPinv=inverse, v0=start, ncv=basis, maxiter=self.max_restarts
-                    )
-                    break
-                except ArpackNoConvergence as stopped:
-                    return _padded(stopped.eigenvalues, stopped.eigenvectors, k, np.nan) if seed == 0 else nothing
-                except ArpackError:  # a high multiplicity exhausted a small basis
-                    pass
-            else:
-                return nothing
+        for seed in range(self.max_restarts + 1):
+            expected = int(usual * missing / k) + 2 * block
+            room = self.basis or 6 * k + 40 * block
+            # Between 0 and the shift, all eigenvalues are wanted; in later searches, all up to the k-th one.
+            count, radius = k - values.size, max(shift, values[-1] - shift if values.size == k else 0.0)
+            further, others = nearest(inverse, mass, shift, vectors, count, radius, block, expected, room, seed)
             order = np.argsort(np.concatenate([values, further]))[:k]
             values = np.concatenate([values, further])[order]
             vectors = np.concatenate([vectors, others], axis=1)[:, order]
-            # Lanczos with single vectors can miss pairs of a multiple eigenvalue. By Sylvester's law of inertia, the
-            # negative pivots of K − σM count the eigenvalues below σ. If pairs are missing, search orthogonally to
-            # known pairs.
+            if values.size < k:
+                missing = k - values.size
+                continue
+            # Lanczos can miss copies of a multiple eigenvalue. By Sylvester's law of inertia, the negative pivots of
+            # K − σM count the eigenvalues below σ. If pairs are missing, search orthogonally to known pairs.
             # The count is just below the last value. If all values are copies of the lowest eigenvalue, the distance is
             # just above their rounding errors; if the factorisation is too inaccurate there, the distance is larger.
             near = max(_BESIDE * (values[-1] - values[0]), 4 * rounding)
-            for distance in (near, _BESIDE * max(values[-1], shift)):
+            for distance in (near, _BESIDE * max(values[-1], scales.below)):
                 below = values[-1] - distance
                 if below <= 0:  # only null vectors
                     return _padded(values, vectors, k, max(below, 0.0))
@@ -159,22 +157,55 @@ class ShiftInvert(Eigensolver[Pencil]):
                     break
             missing = negative - int((values < below).sum())
             if not sound or missing <= 0:
-                return _padded(values, vectors, k, below if sound else np.nan)
+                return _padded(values, _refined(K, M, scales.below, values, vectors), k, below if sound else np.nan)
             report(f"{missing} eigenpairs are missing: searching again")
-            wanted = min(missing + 2, n - 1)
-        return nothing
+        return _padded(values, vectors, k, np.nan)
 
 
-# ARPACK orthogonalises each new vector against the whole basis, which takes more time than the solves if k is large. A
-# basis of 5k/4 + 20 vectors takes as many solves as one of 2k + 20 or fewer, and a sixth less time; for k = 350, a
-# third less. At a restart, ARPACK keeps the converged vectors and half of the remaining basis; each restart takes a few
-# additional solves. On planar domains, ARPACK takes about 9k/4 + 30 solves; on cubes with multiple eigenvalues, up to
-# 1.7 times as many.
-def expected_solves(done: int, basis: int, wanted: int) -> int:
-    """Return the expected total number of solves: as many as usual, or if these are done, until the next restart."""
-    restart = (basis - wanted) // 2 + 4
-    beyond = max(done, 9 * wanted // 4 + 30) - basis
-    return basis + max(1, -(-beyond // restart)) * restart
+class _Scales(NamedTuple):
+    """Estimates from which shifts are chosen."""
+
+    below: float  # a positive number that is small relative to the k-th eigenvalue
+    within: float  # half of the k-th eigenvalue
+    dimension: int  # the dimension d in Weyl's law, by which the j-th eigenvalue grows like j^(2/d)
+
+
+def _scales(K: csc_matrix, M: csc_matrix, k: int, dimension: int | None, volume: float) -> _Scales:
+    if dimension is not None and np.isfinite(volume):
+        return _Scales(0.1 * (2 * np.pi) ** 2 / volume ** (2 / dimension), weyl(k, volume, dimension) / 2, dimension)
+    # On a uniform grid in 2D, the k-th of n eigenvalues is about 2k/n times the median.
+    median = float(np.median(K.diagonal() / M.diagonal()))
+    return _Scales(1e-3 * median, median * k / K.shape[0], 2)
+
+
+# With a shift σ within the wanted eigenvalues, the basis has about 7/4 k vectors; with one below the spectrum, where
+# K − σM is positive definite, it has 9/4 k.
+def _shifted(K: csc_matrix, M: csc_matrix, k: int, scales: _Scales) -> tuple[float, SuperLU]:
+    """Return a shift σ near half of the k-th eigenvalue or, if there is no accurate one, below the spectrum."""
+    shift, wanted = scales.within, k / 2 ** (scales.dimension / 2)
+    for _ in range(_TRIES if k > _FEW and shift > 0 else 0):
+        factor, number, error = inertia(K, M, shift)
+        if factor is not None and error < _ACCURATE and k / 8 <= number <= 3 * k / 4:
+            return shift, factor
+        shift *= np.clip((wanted / max(number, 0.5)) ** (2 / scales.dimension), 1 / 16, 16) * 1.01
+    return -scales.below, factorise_on_host(K + scales.below * M)
+
+
+# If an eigenvalue is near the shift σ, a step of Lanczos amplifies the component along its eigenvector much more than
+# others, and so are rounding errors relative to the others. They have high frequencies, so that residuals may be large
+# relative to low eigenvalues. A solve with K + sM divides an error along φₗ by (λₗ + s)/(λᵢ + s).
+def _refined(K: csc_matrix, M: csc_matrix, s: float, values: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Return the M-orthonormal eigenvectors after a further solve for each pair with a large relative residual."""
+    image = M @ vectors
+    residuals = np.linalg.norm(K @ vectors - image * values, axis=0) / np.linalg.norm(image, axis=0)
+    large = residuals > _POOR * np.maximum(np.abs(values), values[-1] / values.size)
+    if large.any():
+        better = factorise_on_host(K + s * M).solve(image[:, large]) * (values[large] + s)
+        better -= vectors[:, ~large] @ (image[:, ~large].T @ better)
+        # To first order, (3 − G)/2 is the inverse square root of G, which orthonormalises with the least change.
+        gram = better.T @ (M @ better)
+        vectors[:, large] = better @ (1.5 * np.eye(len(gram)) - 0.5 * gram)
+    return vectors
 
 
 def _padded(values: np.ndarray, vectors: np.ndarray, k: int, complete_below: float) -> HostPairs:
