@@ -39,8 +39,8 @@ def nearest(
     """Return the eigenvalues nearest to the shift, in no order, and M-orthonormal eigenvectors as columns.
 
     They are at least ``count``, and all whose distance from the shift is up to ``radius``, except those of known
-    vectors, and copies of multiple eigenvalues; fewer if the basis would need more than ``room`` vectors. The number
-    ``expected`` of basis vectors usually almost suffices.
+    vectors, and copies of multiple eigenvalues; fewer if the basis would need more than ``room`` vectors, and none if
+    solutions are not finite. The number ``expected`` of basis vectors usually almost suffices.
     """
     n, p = known.shape
     room, rng = min(room, n - p), np.random.default_rng(seed)
@@ -66,6 +66,8 @@ def nearest(
         diagonal = image.T @ onward
         diagonal = (diagonal + diagonal.T) / 2
         onward -= current @ diagonal
+        if not np.isfinite(diagonal).all():
+            return np.empty(0), np.empty((n, 0))
         if turn % 2:  # every second step orthogonalises against the whole basis, two blocks at once
             parts = basis[:rows].T @ (basis[:rows] @ np.concatenate([image, mass @ onward], axis=1))
             current = current - parts[:, :width]

@@ -37,7 +37,7 @@ _TRIES = 3
 """The maximal number of shifts that are tried within the spectrum."""
 _POOR = 1e-9
 """The relative residual up to which eigenvectors need no further solve."""
-_ACCURATE = 1e-8
+_ACCURATE = 1e-9
 """The largest error of a factorisation within the spectrum."""
 
 
@@ -52,7 +52,7 @@ class ShiftInvert(Eigensolver[Pencil]):
         tolerance: the relative residual at which a pair counts as converged; Lanczos itself runs until 1e-12.
         max_restarts: the maximal number of searches after the first: for missing copies of multiple eigenvalues, and
             for further pairs if the basis is full.
-        basis: the maximal number of vectors in the Lanczos basis. None means 6k + 160, of which about 2k are used.
+        basis: the maximal number of vectors in the Lanczos basis. None means 4k + 160, of which about 2k are used.
 
     Examples:
         >>> sparse = hj.eigenpairs(field, k=12, solver=hj.ShiftInvert(basis=30))
@@ -109,8 +109,9 @@ class ShiftInvert(Eigensolver[Pencil]):
     def _searched(self, K: csc_matrix, M: csc_matrix, k: int, scales: "_Scales", report: Report) -> HostPairs:
         n = K.shape[0]
         values, vectors = np.empty(0), np.empty((n, 0))
+        nothing = np.full(k, np.nan), np.full((k, n), np.nan), np.nan
         if not (np.isfinite(K.data).all() and np.isfinite(M.data).all()):
-            return _padded(values, vectors, k, np.nan)
+            return nothing
         report("factorising")
         begun, solves, told = time.perf_counter(), 0, 0
         rounding, mass = _rounding(K, M), M.tocsr()
@@ -133,7 +134,7 @@ class ShiftInvert(Eigensolver[Pencil]):
 
         for seed in range(self.max_restarts + 1):
             expected = int(usual * missing / k) + 2 * block
-            room = self.basis or 6 * k + 40 * block
+            room = self.basis or 4 * k + 40 * block
             # Between 0 and the shift, all eigenvalues are wanted; in later searches, all up to the k-th one.
             count, radius = k - values.size, max(shift, values[-1] - shift if values.size == k else 0.0)
             further, others = nearest(inverse, mass, shift, vectors, count, radius, block, expected, room, seed)
@@ -151,15 +152,15 @@ class ShiftInvert(Eigensolver[Pencil]):
             for distance in (near, _BESIDE * max(values[-1], scales.below)):
                 below = values[-1] - distance
                 if below <= 0:  # only null vectors
-                    return _padded(values, vectors, k, max(below, 0.0))
+                    return _ordered(values, vectors, max(below, 0.0))
                 negative, sound = inertia_on_host(K, M, below)
                 if sound:
                     break
             missing = negative - int((values < below).sum())
             if not sound or missing <= 0:
-                return _padded(values, _refined(K, M, scales.below, values, vectors), k, below if sound else np.nan)
+                return _ordered(*_refined(K, M, scales.below, vectors), below if sound else np.nan)
             report(f"{missing} eigenpairs are missing: searching again")
-        return _padded(values, vectors, k, np.nan)
+        return nothing
 
 
 class _Scales(NamedTuple):
@@ -193,28 +194,27 @@ def _shifted(K: csc_matrix, M: csc_matrix, k: int, scales: _Scales) -> tuple[flo
 
 # If an eigenvalue is near the shift σ, a step of Lanczos amplifies the component along its eigenvector much more than
 # others, and so are rounding errors relative to the others. They have high frequencies, so that residuals may be large
-# relative to low eigenvalues. A solve with K + sM divides an error along φₗ by (λₗ + s)/(λᵢ + s).
-def _refined(K: csc_matrix, M: csc_matrix, s: float, values: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Return the M-orthonormal eigenvectors after a further solve for each pair with a large relative residual."""
-    image = M @ vectors
-    residuals = np.linalg.norm(K @ vectors - image * values, axis=0) / np.linalg.norm(image, axis=0)
-    large = residuals > _POOR * np.maximum(np.abs(values), values[-1] / values.size)
+# relative to low eigenvalues. A solve with K + sM divides an error along φₗ by (λₗ + s)/(λᵢ + s). Rayleigh quotients
+# are accurate in any case, because errors of eigenvectors enter them squared.
+def _refined(K: csc_matrix, M: csc_matrix, s: float, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return eigenvalues, and the M-orthonormal eigenvectors after a further solve for those with large residuals."""
+    force, image = K @ vectors, M @ vectors
+    values = np.sum(vectors * force, axis=0)
+    residuals = np.linalg.norm(force - image * values, axis=0) / np.linalg.norm(image, axis=0)
+    large = residuals > _POOR * np.maximum(np.abs(values), np.abs(values).max() / values.size)
     if large.any():
         better = factorise_on_host(K + s * M).solve(image[:, large]) * (values[large] + s)
         better -= vectors[:, ~large] @ (image[:, ~large].T @ better)
         # To first order, (3 − G)/2 is the inverse square root of G, which orthonormalises with the least change.
         gram = better.T @ (M @ better)
-        vectors[:, large] = better @ (1.5 * np.eye(len(gram)) - 0.5 * gram)
-    return vectors
+        vectors[:, large] = better = better @ (1.5 * np.eye(len(gram)) - 0.5 * gram)
+        values[large] = np.sum(better * (K @ better), axis=0)
+    return values, vectors
 
 
-def _padded(values: np.ndarray, vectors: np.ndarray, k: int, complete_below: float) -> HostPairs:
-    order, missing = np.argsort(values), k - values.size
-    return (
-        np.pad(values[order], (0, missing), constant_values=np.nan),
-        np.pad(vectors[:, order].T, [(0, missing), (0, 0)], constant_values=np.nan),
-        complete_below,
-    )
+def _ordered(values: np.ndarray, vectors: np.ndarray, complete_below: float) -> HostPairs:
+    order = np.argsort(values)
+    return values[order], vectors[:, order].T, complete_below
 
 
 def _rounding(K: csc_matrix, M: csc_matrix) -> float:
