@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
+from scipy.linalg import eigh
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import SuperLU
 from threadpoolctl import threadpool_limits
@@ -205,10 +206,8 @@ def _refined(K: csc_matrix, M: csc_matrix, s: float, vectors: np.ndarray) -> tup
     if large.any():
         better = factorise_on_host(K + s * M).solve(image[:, large]) * (values[large] + s)
         better -= vectors[:, ~large] @ (image[:, ~large].T @ better)
-        # To first order, (3 − G)/2 is the inverse square root of G, which orthonormalises with the least change.
-        gram = better.T @ (M @ better)
-        vectors[:, large] = better = better @ (1.5 * np.eye(len(gram)) - 0.5 * gram)
-        values[large] = np.sum(better * (K @ better), axis=0)
+        values[large], mix = eigh(better.T @ (K @ better), better.T @ (M @ better))
+        vectors[:, large] = better @ mix
     return values, vectors
 
 
