@@ -29,12 +29,15 @@ _SMALL = 1500
 _LARGE = {2: 8_000_000, 3: 800_000}
 """The least n·k (unknowns times pairs) for which a solver in JAX is chosen, for each dimension; 2 stands for None."""
 
+_DIFFERENTIATED_IN_JAX = 800_000
+"""The least n·k for which derivatives of eigenpairs from shift-invert are compiled outside `jit`."""
+
 
 def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensolver:
     """Return the solver with the given name.
 
-    ``"auto"`` chooses by the pencil's size, k and dtype. On accelerators, and under `jax.jit` with several devices,
-    ``"auto"`` never chooses shift-invert, because shift-invert runs on the host.
+    ``"auto"`` chooses by the pencil's size, k and dtype. On accelerators, and under `jax.jit` with several devices or a
+    cache of compiled programs, ``"auto"`` never chooses shift-invert, because shift-invert runs on the host.
 
     Raises:
         ValueError: the name is unknown.
@@ -80,9 +83,10 @@ def choose_for_fit(pencil: AnyPencil, k: int) -> Eigensolver:
 def _host_called(n: int, k: int, dimension: int | None) -> bool:
     """Return whether a program under `jax.jit` calls the host for eigenpairs.
 
-    With several devices, XLA might call the host on each of them.
+    With several devices, XLA might call the host on each of them. JAX cannot store such a program in a cache.
     """
-    return n * k < _LARGE[dimension or 2] and jax.default_backend() == "cpu" and jax.device_count() == 1
+    alone = jax.default_backend() == "cpu" and jax.device_count() == 1
+    return n * k < _LARGE[dimension or 2] and alone and not jax.config.jax_compilation_cache_dir
 
 
 def _in_jax(pencil: Pencil, k: int) -> Eigensolver:
@@ -99,10 +103,10 @@ def _automatic(pencil: Pencil, k: int) -> Eigensolver:
     n, dimension = pencil.space.n_dof, pencil.space.dimension
     if n <= max(_SMALL, 4 * k - 1):
         return Dense()
-    if is_concrete_on_cpu(jax.lax.stop_gradient((pencil.stiffness, pencil.mass))):
-        return ShiftInvert() if n * k < _LARGE[dimension or 2] else _in_jax(pencil, k)
-    if not (_host_called(n, k, dimension) and pencil.bounded):  # under `jit`, a second solver cannot follow
+    known = is_concrete_on_cpu(jax.lax.stop_gradient((pencil.stiffness, pencil.mass)))
+    # Under `jit`, a second solver cannot follow if shift-invert leaves doubt, as it may without a lower bound.
+    if not (n * k < _LARGE[dimension or 2] if known else _host_called(n, k, dimension) and pencil.bounded):
         return _in_jax(pencil, k)
-    # In later calls, derivatives in JAX are twice as fast as on the host; in 3D and in float32, they are not.
-    exact = pencil.stiffness.dtype == np.float64
-    return ShiftInvert(adjoint=FactorisedAdjoint()) if exact and dimension != 3 else ShiftInvert()
+    # Derivatives in JAX take half of the time, except in 3D and in float32, but several seconds of compilation.
+    in_jax = (not known or n * k >= _DIFFERENTIATED_IN_JAX) and pencil.stiffness.dtype == np.float64 and dimension != 3
+    return ShiftInvert(adjoint=FactorisedAdjoint()) if in_jax else ShiftInvert()
