@@ -22,6 +22,8 @@ _NOTHING = 1e-13
 """The norm at which a direction counts as contained in the basis, relative to the largest entry of VᵀMAV."""
 _SMALL = 1e-6
 """The norm, likewise relative, of directions that are orthogonalised again after normalisation."""
+_CROWDED = 3
+"""If the basis has a third of all dimensions, which few eigenvalues are left to fill, every step orthogonalises."""
 
 
 def nearest(
@@ -68,7 +70,8 @@ def nearest(
         onward -= current @ diagonal
         if not np.isfinite(diagonal).all():
             return np.empty(0), np.empty((n, 0))
-        if turn % 2:  # every second step orthogonalises against the whole basis, two blocks at once
+        crowded = _CROWDED * (rows + width) > n
+        if turn % 2 or crowded:  # every second step orthogonalises against the whole basis, two blocks at once
             parts = basis[:rows].T @ (basis[:rows] @ np.concatenate([image, mass @ onward], axis=1))
             current = current - parts[:, :width]
             onward -= parts[:, width:]
@@ -78,9 +81,10 @@ def nearest(
         m, turn, before = m + width, turn + 1, current
         largest = max(largest, np.abs(diagonal).max())
         current, image, coupling = _orthonormal(mass, onward, _NOTHING * largest)
-        if np.linalg.norm(coupling, axis=1).min(initial=np.inf) < _SMALL * largest:
-            # The normalisation of a small direction has enlarged its components along the basis.
-            current, image, change = _orthonormal(mass, project(current), 0.0)
+        if crowded or np.linalg.norm(coupling, axis=1).min(initial=np.inf) < _SMALL * largest:
+            # The normalisation of a small direction has enlarged its components along the basis; a direction that
+            # consists of these is dropped.
+            current, image, change = _orthonormal(mass, project(current), 0.5)
             coupling = change @ coupling
         if m >= expected or m == room:
             theta, modes = np.linalg.eigh(matrix[:m, :m])
@@ -94,7 +98,8 @@ def nearest(
         if not current.shape[1]:
             current, image, _ = random_block()
             coupling = np.zeros((current.shape[1], width))
-        current, image, coupling = current[:, : room - m], image[:, : room - m], coupling[: room - m]
+        left = slice(max(len(coupling) - (room - m), 0), None)  # the last directions are the largest
+        current, image, coupling = current[:, left], image[:, left], coupling[left]
         after = slice(m, m + len(coupling))
         matrix[after, m - width : m] = coupling
         matrix[m - width : m, after] = coupling.T
