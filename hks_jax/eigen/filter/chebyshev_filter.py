@@ -145,7 +145,7 @@ def _iterate(
     rounds = _FIRST_ROUNDS
     while grids:
         for _ in range(rounds):
-            state = grid.improve(rounding, state)
+            state = grid.improve_coarse(rounding, state)
         if not is_traced(state):
             report(f"grid {' × '.join(map(str, grid.pencil.shape))}")
         coarse, grid, rounds = grid, grids.pop(), _COARSE_ROUNDS
