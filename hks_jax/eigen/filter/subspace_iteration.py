@@ -1,7 +1,6 @@
 """Rounds of subspace iteration: a Chebyshev filter, followed by a Rayleigh–Ritz projection."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -22,6 +21,7 @@ from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.halo import Slabs
 from hks_jax.fem.nodal import NodalPencil, to_rows
 from hks_jax.linear.accelerators import row_by_row
+from hks_jax.linear.chebyshev import Columns
 from hks_jax.linear.loops import for_each
 from hks_jax.linear.products import aligned
 
@@ -82,6 +82,16 @@ class Filtering(NamedTuple):
     values: Values  # the value ψ of each vector, at which its polynomial is 1
     factor: Values  # the factor by which each vector's correction is scaled
     allowed: Values  # the residual up to which each vector counts as converged; blocks of such vectors are not filtered
+
+
+class Block(NamedTuple):
+    """Some vectors that are filtered together, with their entries of `Filtering`."""
+
+    vectors: Columns
+    values: Float[Array, " b"]
+    factor: Float[Array, " b"]
+    allowed: Float[Array, " b"]
+    degree: Number
 
 
 class GridFilter(eqx.Module):
@@ -208,34 +218,25 @@ class GridFilter(eqx.Module):
         degrees = jnp.max(degrees.reshape(-1, plan.block), axis=1).astype(int)
         return Filtering(band, terms, degrees, filtered_values, factor, self._allowed(rounding, state.values))
 
-    @partial(jax.jit, donate_argnames="vectors")
     def filter_block(self, chosen: Filtering, number: Number, own: Number, vectors: OwnRows) -> OwnRows:
         """Filter the block of vectors with index ``number`` among all blocks and ``own`` among this device's blocks."""
-        pencil, block = self.pencil, self.plan.block
-        x = subspace.block_of(vectors, own, block, pencil.shape)
-        zeta, scale, allowed = (
+        block = self._block(chosen, number, own, vectors)
+        return self._plus(_change(self.pencil, chosen.band, chosen.terms, block), own, vectors)
+
+    @jit_quickly()
+    def _block(self, chosen: Filtering, number: Number, own: Number, vectors: OwnRows) -> Block:
+        block = self.plan.block
+        values, factor, allowed = (
             jax.lax.dynamic_slice_in_dim(of_all, number * block, block)
             for of_all in (chosen.values, chosen.factor, chosen.allowed)
         )
+        x = subspace.block_of(vectors, own, block, self.pencil.shape)
+        return Block(x, values, factor, allowed, chosen.degrees[number])
 
-        def total(terms: Float[Array, "*shape b"]) -> Float[Array, " b"]:
-            return jnp.sum(terms, tuple(range(terms.ndim - 1)))
-
-        image, moved = pencil.products()(x)
-        residual = image - aligned(total(x * image) / total(x * moved), x) * moved
-        left = ~(total(residual**2) <= allowed**2 * total(moved**2))
-
-        def filtered(image: Float[Array, "*shape b"], residual: Float[Array, "*shape b"]) -> Float[Array, "*shape b"]:
-            # If the quotient ζ of x is in the damped band, the residual is large, and the polynomial is applied to x.
-            inside = aligned(zeta > chosen.band.low, x)
-            of_residual = jnp.where(inside, image, residual).astype(jnp.float32)
-            whole = jnp.where(inside, x, 0).astype(jnp.float32)
-            degree = chosen.degrees[number]
-            z = correction(pencil, chosen.band, of_residual, zeta, degree, whole, chosen.terms)
-            return jnp.where(inside, 1, aligned(jnp.clip(scale, 0, 1), x)) * z.astype(x.dtype)
-
-        z = jax.lax.cond(jnp.any(left), filtered, lambda *_: jnp.zeros_like(x), image, residual)
-        rows = row_by_row(jax.lax.dynamic_slice_in_dim(vectors, own * block, block)) + row_by_row(to_rows(z))
+    @jit_quickly(donate_argnames="vectors")
+    def _plus(self, change: Columns, own: Number, vectors: OwnRows) -> OwnRows:
+        block = self.plan.block
+        rows = row_by_row(jax.lax.dynamic_slice_in_dim(vectors, own * block, block)) + row_by_row(to_rows(change))
         return jax.lax.dynamic_update_slice_in_dim(vectors, rows, own * block, axis=0)
 
     @jit_quickly(donate_argnames="vectors")
@@ -250,6 +251,30 @@ class GridFilter(eqx.Module):
     def _begin(self, rows: OwnRows) -> FilterState:
         zero = jnp.zeros((), int)
         return self.ritz(subspace.to_slabs(self.slabs, self.plan.block, rows), zero, zero)
+
+
+# The program is the same for every number of vectors, such as those of both problems of "mean".
+@jax.jit
+def _change(pencil: NodalPencil, band: Band, terms: Number, block: Block) -> Columns:
+    """Return what the filter adds to the vectors of a block."""
+    x, zeta, scale, allowed, degree = block
+
+    def total(terms: Columns) -> Float[Array, " b"]:
+        return jnp.sum(terms, tuple(range(terms.ndim - 1)))
+
+    image, moved = pencil.products()(x)
+    residual = image - aligned(total(x * image) / total(x * moved), x) * moved
+    left = ~(total(residual**2) <= allowed**2 * total(moved**2))
+
+    def filtered(image: Columns, residual: Columns) -> Columns:
+        # If the quotient ζ of x is in the damped band, the residual is large, and the polynomial is applied to x.
+        inside = aligned(zeta > band.low, x)
+        of_residual = jnp.where(inside, image, residual).astype(jnp.float32)
+        whole = jnp.where(inside, x, 0).astype(jnp.float32)
+        z = correction(pencil, band, of_residual, zeta, degree, whole, terms)
+        return jnp.where(inside, 1, aligned(jnp.clip(scale, 0, 1), x)) * z.astype(x.dtype)
+
+    return jax.lax.cond(jnp.any(left), filtered, lambda *_: jnp.zeros_like(x), image, residual)
 
 
 def _lumping(plan: FilterPlan, state: FilterState) -> tuple[Number, Values, Values]:
