@@ -145,7 +145,8 @@ def _iterate(
     rounds = _FIRST_ROUNDS
     while grids:
         for _ in range(rounds):
-            state = grid.improve_coarse(rounding, state)
+            # Both problems of "mean" and all rounds share these programs, unlike those of `improve`.
+            state = grid.improve_told(rounding, state) if plan.mesh is None else grid.improve(rounding, state)
         if not is_traced(state):
             report(f"grid {' × '.join(map(str, grid.pencil.shape))}")
         coarse, grid, rounds = grid, grids.pop(), _COARSE_ROUNDS

@@ -47,6 +47,8 @@ _MOST_TERMS = 15
 
 Number = Int[Array, ""]
 Values = Float[Array, " m"]
+Rows = Float[Array, "m nodes"]
+"""All vectors; each of several devices has a slab of them."""
 OwnRows = Float[Array, "own nodes"]
 """The vectors that this device filters, on all nodes of the grid."""
 
@@ -120,13 +122,16 @@ class GridFilter(eqx.Module):
     def _spare(self) -> Bool[np.ndarray, " m"]:
         return np.arange(self.plan.size) >= self.plan.wanted
 
-    @jit_quickly()
     def from_random(self, volume: Scalar) -> FilterState:
         """Return the state after filtering random functions."""
+        return self._begin(self._random(volume))
+
+    @jit_quickly()
+    def _random(self, volume: Scalar) -> Rows:
         plan, shape, dtype = self.plan, self.pencil.shape, self.high.dtype
         low = jnp.minimum(1.3 * weyl(plan.size, volume, len(shape)).astype(dtype), self.high / 3)
 
-        def run(grid: GridFilter, low: Scalar) -> FilterState:
+        def run(grid: GridFilter, low: Scalar) -> Rows:
             pencil, band = grid.pencil, Band(low, grid.high)
             degree = jnp.ceil(band.degree_for(jnp.zeros_like(low), _SPREAD)).astype(int)
 
@@ -137,36 +142,45 @@ class GridFilter(eqx.Module):
 
             numbers = subspace.own_blocks(grid.slabs, plan.size // plan.block)
             keys = jax.random.split(jax.random.key(0), plan.size // plan.block)[numbers]
-            return grid._begin(jax.lax.map(damped, keys).reshape(-1, pencil.free.size))
+            own = jax.lax.map(damped, keys).reshape(-1, pencil.free.size)
+            return subspace.to_slabs(grid.slabs, plan.block, own)
 
-        return subspace.shared(self.slabs, run, EVERYWHERE, _layout(self.slabs))(self, low)
+        return subspace.shared(self.slabs, run, EVERYWHERE, _layout(self.slabs).vectors)(self, low)
+
+    def from_rows(self, rows: Rows) -> FilterState:
+        """Return the state in the span of functions on the whole grid."""
+        return self._begin(self._dealt(rows))
 
     @jit_quickly()
-    def from_rows(self, rows: Float[Array, "m nodes"]) -> FilterState:
-        """Return the state in the span of functions on the whole grid."""
+    def _dealt(self, rows: Rows) -> Rows:
         plan, layout = self.plan, _layout(self.slabs)
 
-        def run(grid: GridFilter, rows: Float[Array, "m nodes"]) -> FilterState:
+        def run(grid: GridFilter, rows: Rows) -> Rows:
             numbers = subspace.own_blocks(grid.slabs, plan.size // plan.block)
-            return grid._begin(rows.reshape(-1, plan.block, rows.shape[1])[numbers].reshape(-1, rows.shape[1]))
+            own = rows.reshape(-1, plan.block, rows.shape[1])[numbers].reshape(-1, rows.shape[1])
+            return subspace.to_slabs(grid.slabs, plan.block, own)
 
-        return subspace.shared(self.slabs, run, (EVERYWHERE, EVERYWHERE), layout)(self, rows)
+        return subspace.shared(self.slabs, run, (EVERYWHERE, EVERYWHERE), layout.vectors)(self, rows)
 
-    @jit_quickly()
     def from_coarse(self, coarse: "GridFilter", state: FilterState) -> FilterState:
         """Return the state interpolated from the next coarser grid."""
+        return self._begin(self._interpolated(coarse, state.vectors))
+
+    @jit_quickly()
+    def _interpolated(self, coarse: "GridFilter", vectors: Float[Array, "m coarse_nodes"]) -> Rows:
         slabs, shape, block = coarse.slabs, coarse.pencil.shape, self.plan.block
 
-        def run(grid: GridFilter, vectors: Float[Array, "m coarse_nodes"]) -> FilterState:
+        def run(grid: GridFilter, vectors: Float[Array, "m coarse_nodes"]) -> Rows:
             rows = subspace.to_own_rows(slabs, block, vectors)
 
             def of_block(number: Array) -> Float[Array, "b nodes"]:
                 return to_rows(interpolate(grid.pencil, subspace.block_of(rows, number, block, shape)))
 
-            return grid._begin(jax.lax.map(of_block, jnp.arange(len(rows) // block)).reshape(len(rows), -1))
+            own = jax.lax.map(of_block, jnp.arange(len(rows) // block)).reshape(len(rows), -1)
+            return subspace.to_slabs(grid.slabs, block, own)
 
-        layout = _layout(self.slabs)
-        return subspace.shared(self.slabs, run, (EVERYWHERE, layout.vectors), layout)(self, state.vectors)
+        layout = _layout(self.slabs).vectors
+        return subspace.shared(self.slabs, run, (EVERYWHERE, layout), layout)(self, vectors)
 
     def improve_told(
         self, rounding: Scalar, state: FilterState, done: Callable[[int, int], Any] | None = None
@@ -178,7 +192,7 @@ class GridFilter(eqx.Module):
         """
         slabs, plan, layout = self.slabs, self.plan, _layout(self.slabs)
 
-        def run(grid: GridFilter, rounding: Scalar, state: FilterState) -> FilterState:
+        def run(grid: GridFilter, rounding: Scalar, state: FilterState) -> tuple[Rows, Number]:
             numbers = subspace.own_blocks(slabs, plan.size // plan.block)
             chosen = grid.choose(rounding, state)
 
@@ -193,13 +207,13 @@ class GridFilter(eqx.Module):
 
             own_rows = subspace.to_own_rows(slabs, plan.block, state.vectors)
             filtered = for_each(_PASSES * numbers.size, step, own_rows)
-            return grid.ritz(subspace.to_slabs(slabs, plan.block, filtered), chosen.terms, state.rounds + 1)
+            return subspace.to_slabs(slabs, plan.block, filtered), chosen.terms
 
-        return subspace.shared(slabs, run, (EVERYWHERE, EVERYWHERE, layout), layout)(self, rounding, state)
+        ends = layout.vectors, EVERYWHERE
+        vectors, terms = subspace.shared(slabs, run, (EVERYWHERE, EVERYWHERE, layout), ends)(self, rounding, state)
+        return self.ritz(vectors, terms, state.rounds + 1)
 
     improve = jax.jit(improve_told, donate_argnames="state")
-    # The faster options make the filter's loop 5 % slower, which does not matter on a coarse grid.
-    improve_coarse = jit_quickly(donate_argnames="state")(improve_told)
 
     @jit_quickly()
     def choose(self, rounding: Scalar, state: FilterState) -> Filtering:
@@ -240,17 +254,22 @@ class GridFilter(eqx.Module):
         return jax.lax.dynamic_update_slice_in_dim(vectors, rows, own * block, axis=0)
 
     @jit_quickly(donate_argnames="vectors")
-    def ritz(self, vectors: Float[Array, "m nodes"], terms: Number, rounds: Number) -> FilterState:
+    def ritz(self, vectors: Rows, terms: Number, rounds: Number) -> FilterState:
         """Return the state with the Ritz vectors of the subspace that the given vectors span."""
-        slabs, block = self.slabs, self.plan.block
-        own = self.pencil.own(slabs)
-        values, vectors = subspace.rayleigh_ritz(own, slabs, block, vectors)
-        residuals, lumped_values = subspace.measured(own, slabs, block, values, vectors)
-        return FilterState(values, vectors, residuals, lumped_values, terms, rounds)
+        slabs, block, layout = self.slabs, self.plan.block, _layout(self.slabs)
 
-    def _begin(self, rows: OwnRows) -> FilterState:
+        def run(grid: GridFilter, vectors: Rows, terms: Number, rounds: Number) -> FilterState:
+            own = grid.pencil.own(slabs)
+            values, vectors = subspace.rayleigh_ritz(own, slabs, block, vectors)
+            residuals, lumped_values = subspace.measured(own, slabs, block, values, vectors)
+            return FilterState(values, vectors, residuals, lumped_values, terms, rounds)
+
+        given = EVERYWHERE, layout.vectors, EVERYWHERE, EVERYWHERE
+        return subspace.shared(slabs, run, given, layout)(self, vectors, terms, rounds)
+
+    def _begin(self, vectors: Rows) -> FilterState:
         zero = jnp.zeros((), int)
-        return self.ritz(subspace.to_slabs(self.slabs, self.plan.block, rows), zero, zero)
+        return self.ritz(vectors, zero, zero)
 
 
 # The program is the same for every number of vectors, such as those of both problems of "mean".
