@@ -1,5 +1,6 @@
 """Figures 1 to 6: the HKS of a surface, near boundaries, of tensor fields and of a slice of a brain."""
 
+import importlib.util
 import math
 from collections.abc import Callable
 from fractions import Fraction
@@ -7,11 +8,9 @@ from fractions import Fraction
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from matplotlib import colormaps
 from matplotlib.figure import Figure
 from matplotlib.patches import ConnectionPatch, Rectangle
-from scipy.ndimage import distance_transform_edt
-from signature import continued_signature, enough_pairs, flat_signature, signature
+from signature import continued_signature, enough_pairs, flat_signature, signature, signature_and_influence
 from table1 import interpolate_periodic
 
 from hks_jax import plot
@@ -22,14 +21,16 @@ from hks_jax.domain.examples import (
     degenerate_point_field,
     figure3_fields,
     figure4_fields,
-    phantom,
 )
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_checks import MetricChoice
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.boundary import crop, reflect
-from hks_jax.io import TensorVolume, erode, find_example_brain, fit_dwi
-from hks_jax.plot.signature import bounding_box, placed
+from hks_jax.io import erode, find_example_brain, fit_dwi
+from hks_jax.plot.figure import RIM_NOTE
+from hks_jax.plot.panels import BESIDE
+from hks_jax.plot.signature import cropped, free_colours, placed
+from hks_jax.signatures.times import FREE
 
 SIZES: dict[str, tuple] = {
     "figure1": ((100, 150), (400, 300)),
@@ -40,9 +41,10 @@ SIZES: dict[str, tuple] = {
 }
 """The nodes per axis of quick and full runs, and for Figure 1 the number of eigenpairs."""
 TIMES = {"figure1": 1.0, "figure2": 0.01, "figure3": 1.0, "figure4": 0.01, "figure5": 0.25}
-LENGTHS = (5.0, 10.0, 20.0, 40.0)
-"""The diffusion lengths of the columns of Figure 6 in mm. For the metric D, the time is the squared length times the
-median diffusivity; for the metric D⁻¹, the time is the squared length divided by the median diffusivity."""
+LENGTHS = (5.0, 7.0, 10.0, 14.0)
+"""The diffusion lengths of the columns of Figure 6 in mm; at longer ones, the boundary reaches most of the slice. For
+the metric D, the time is the squared length times the median diffusivity; for the metric D⁻¹, the time is the squared
+length divided by the median diffusivity."""
 DRAWN = 200
 """The vertices per axis of the drawn surface in Figure 1."""
 ANGLES = ("0", "π/4", "π/2", "3π/4", "π", "5π/4", "3π/2")
@@ -214,62 +216,55 @@ def figure5(full: bool, echo: Callable[[str], None]) -> Figure:
     return fig
 
 
-def figure6(full: bool, echo: Callable[[str], None]) -> Figure:
-    """Return Figure 6 for a slice of the brain in the PyPI wheel ``mdt`` if it is installed, otherwise of a phantom."""
-    volume, name = _brain(echo), "brain"
-    if volume is None:
-        tensors, mask, spacing = phantom()
-        volume, name = TensorVolume(tensors, spacing, (0.0, 0.0), mask), "phantom"
-    assert volume.mask is not None
-    box = bounding_box(volume.mask)
+def figure6(full: bool, echo: Callable[[str], None]) -> Figure | dict[str, str]:
+    """Return Figure 6 for the brain of ``hks-jax demo``, or nothing where that brain or DIPY is not installed."""
+    brain = find_example_brain()
+    if brain is None or importlib.util.find_spec("dipy") is None:
+        echo('skipped: the brain is in the wheel mdt==1.2.7 (pip install --no-deps), and its fit needs "hks-jax[dti]"')
+        return {}
+    volume = fit_dwi(brain.images, brain.bval, brain.bvec, brain.mask, b_max=1000.0).slice("z", 0)
+    volume = volume.with_mask(erode(volume.inside, 2))
+    inside = volume.grid("largest").inside
+    shown, box = cropped(volume, inside)
     orientation = placed(volume, box, "neurological")
     tensors = volume.tensors[box]
-    grid = Grid(tensors.shape[:2], volume.spacing, mask=volume.mask[box], components="largest")
-    depth = distance_transform_edt(np.pad(grid.inside, 1), sampling=grid.spacing)[1:-1, 1:-1]
+    grid = Grid(shown.shape, shown.spacing, shown.origin, inside[box])
     diffusivity = np.trace(tensors, axis1=-2, axis2=-1) / 2
+    anisotropy = np.ptp(np.linalg.eigvalsh(tensors), axis=-1) / np.maximum(2 * diffusivity, 1e-12)
     typical = float(np.median(diffusivity[grid.inside]))
     rows: dict[MetricChoice, tuple[str, float, str]] = {
-        "tensor": ("$T = D$, as in the paper", typical, "mm⁴/s"),
-        "inverse": ("$g = D^{-1}$", 1 / typical, "s"),
+        "tensor": ("$D$", typical, "mm⁴/s"),
+        "inverse": ("$D^{-1}$", 1 / typical, "s"),
     }
 
-    colours = colormaps["viridis"].with_extremes(over="0.85")
-    fig = plot.new_figure(15.5, 8.6)
+    fig = plot.new_figure(12.4, 6.7)
     panels = fig.subplots(2, 5, sharex=True, sharey=True)
-    plot.scalar_image(panels[0, 0], 1e3 * diffusivity, grid, quantiles=(0.01, 0.99), orientation=orientation)
-    panels[0, 0].set_title("mean diffusivity\nin $10^{-3}$ mm²/s", fontsize="medium")
-    eigenvalues = np.linalg.eigvalsh(tensors)
-    anisotropy = np.ptp(eigenvalues, axis=-1) / np.maximum(eigenvalues.sum(axis=-1), 1e-12)
-    plot.scalar_image(panels[1, 0], anisotropy, grid, quantiles=(0.01, 0.99), orientation=orientation)
-    panels[1, 0].set_title("anisotropy\n$(λ_1 - λ_2)/(λ_1 + λ_2)$", fontsize="medium")
-    for row, (metric, (label, area, unit)) in zip(panels, rows.items(), strict=True):
+    scalars = {
+        "mean diffusivity\nin $10^{-3}$ mm²/s": 1e3 * diffusivity,
+        "anisotropy\n$(λ_1 - λ_2)/(λ_1 + λ_2)$": anisotropy,
+    }
+    for ax, (title, scalar) in zip(panels[:, 0], scalars.items(), strict=True):
+        plot.scalar_image(ax, scalar, grid, orientation=orientation, **BESIDE)
+        ax.set_title(title, fontsize="medium")
+        ax.set_ylabel("mm", fontsize="small")
+    for row, (metric, (name, area, unit)) in zip(panels[:, 1:], rows.items(), strict=True):
         field = TensorField.from_diffusion(grid, tensors, metric=metric)
         times = [length**2 * area for length in LENGTHS]
-        k = enough_pairs(field, times[0], exponent=10.0 if full else 6.0)
-        echo(f"{name}, {label}, {int(grid.inside.sum())} nodes, {k} eigenpairs")
-        values = signature(field, times, k)
-        for ax, image, t, length in zip(row[1:], values, times, LENGTHS, strict=True):
-            # The Neumann boundary raises the HKS up to fourfold, so values away from this boundary set the colours.
-            tissue = depth > min(2 * length, 0.3 * depth.max())
-            low, high = np.quantile(image[tissue], (0.01, 0.99)).tolist()
-            plot.scalar_image(ax, image, grid, cmap=colours, vmin=low, vmax=high, orientation=orientation)
-            ax.set_title(f"{label}\n$t$ = {plot.number_text(t)} {unit}", fontsize="medium")
-        row[0].set_ylabel("mm")
+        k = 2 * enough_pairs(field, times[0], exponent=10.0 if full else 6.0)
+        echo(f"metric {metric}, {int(grid.inside.sum())} nodes, {k} eigenpairs of both boundary problems")
+        values, influence = signature_and_influence(field, times, k)
+        near = influence > FREE
+        colours = free_colours(values, near, grid.inside, 1.0)
+        for i, (ax, t, length) in enumerate(zip(row, times, LENGTHS, strict=True)):
+            low, high, cmap = colours[i]
+            style = {"vmin": low, "vmax": high, "cmap": cmap, "label": rf"$4\pi t$·HKS, metric {name}"}
+            plot.scalar_image(ax, values[i], grid, hatched=near[i], orientation=orientation, **style)
+            ax.set_title(f"{length:g} mm\n$t$ = {plot.number_text(t)} {unit}", fontsize="medium")
     for ax in panels[1]:
-        ax.set_xlabel("mm")
-    fig.suptitle(f"Diffusion tensors of a {name} and their HKS, which the Neumann boundary raises (grey: out of range)")
+        ax.set_xlabel("mm", fontsize="small")
+    fig.suptitle(
+        "Brain slice. Above: the metric is the diffusion tensor $D$, as in the paper; below: $D^{-1}$\n"
+        f"4πt·HKS = 1 means flat; heat has spread over {LENGTHS[0]:g} to {LENGTHS[-1]:g} mm; hatched: {RIM_NOTE}",
+        fontsize="medium",
+    )
     return fig
-
-
-def _brain(echo: Callable[[str], None]) -> TensorVolume | None:
-    brain = find_example_brain()
-    if brain is None:
-        echo("no brain is installed (the wheel mdt==1.2.7 contains one), so a phantom is drawn")
-        return None
-    try:
-        volume = fit_dwi(brain.images, brain.bval, brain.bvec, brain.mask, b_max=1100)
-    except ImportError as error:
-        echo(f"{error}; drawing a phantom")
-        return None
-    assert volume.mask is not None
-    return volume.with_mask(erode(volume.mask, 2)).slice("z", 0)

@@ -31,7 +31,8 @@ ITEMS: dict[str, Callable[[bool, Echo], Figure | dict[str, str]]] = {
     "figure6": figures.figure6,
     "triangles": triangles.make,
 }
-"""The function that makes each table or figure; it returns a figure, or a dictionary from file names to texts."""
+"""The function that makes each table or figure; it returns a figure, or a dictionary from file names to texts,
+which is empty if the figure's data are not installed."""
 
 
 def run(output: Path, full: bool, names: list[str], echo: Echo = print) -> list[Path]:
@@ -51,8 +52,8 @@ def run(output: Path, full: bool, names: list[str], echo: Echo = print) -> list[
         else:
             for path, text in zip(paths, made.values(), strict=True):
                 path.write_text(text, encoding="utf-8")
-        seconds = time.perf_counter() - start
-        say(f"{', '.join(str(path) for path in paths)} ({seconds:.0f} s)")
+        if paths:
+            say(f"{', '.join(str(path) for path in paths)} ({time.perf_counter() - start:.0f} s)")
         written += paths
     return written
 
@@ -60,7 +61,7 @@ def run(output: Path, full: bool, names: list[str], echo: Echo = print) -> list[
 def main() -> None:
     """Read the command line, and write tables and figures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--full", action="store_true", help="the paper's sizes, which take minutes instead of seconds")
+    parser.add_argument("--full", action="store_true", help="the sizes of the paper, which take longer")
     parser.add_argument("--only", nargs="+", choices=ITEMS, default=list(ITEMS), metavar="NAME", help=", ".join(ITEMS))
     parser.add_argument("-o", "--output", type=Path, default=Path("paper"), metavar="FOLDER")
     arguments = parser.parse_args()

@@ -15,6 +15,7 @@ from hks_jax.eigen.driver import eigenpairs
 from hks_jax.eigen.weyl import weyl_number
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.signatures.hks import Normalisation, hks
+from hks_jax.signatures.rim import boundary_influence
 from hks_jax.spectrum_free.heat_diagonal import hks_spectrum_free
 
 SMALL = 10_000
@@ -34,6 +35,14 @@ def signature(
         warnings.filterwarnings("ignore", "k = .* cuts a multiple eigenvalue", AccuracyWarning)
         pairs = eigenpairs(domain, k, boundary)
     return np.asarray(hks(pairs, np.asarray(times), normalisation))
+
+
+def signature_and_influence(
+    field: TensorField, times: Sequence[float], k: int
+) -> tuple[Float[np.ndarray, "n_times *shape"], Float[np.ndarray, "n_times *shape"]]:
+    """Return 4πt·HKS with the boundary condition "mean", and the boundary's influence on it."""
+    pairs = eigenpairs(field, k, "mean", multiplet="drop")
+    return np.asarray(hks(pairs, np.asarray(times), "flat")), np.asarray(boundary_influence(pairs, np.asarray(times)))
 
 
 def enough_pairs(field: TensorField, time: float, boundary: str = "neumann", exponent: float = 8.0) -> int:

@@ -26,6 +26,7 @@ from hks_jax.signatures.hks import Normalisation
 from hks_jax.signatures.rim import estimate_of, free_share, influence_of, is_estimated, is_known, rim_of
 from hks_jax.signatures.spans import SHORTEST, resolved_span
 from hks_jax.signatures.times import FREE, RESOLVED, default_k, times_of
+from hks_jax.signatures.truncation import truncated_share
 
 EARLY = 0.02
 """The truncated share of the signature above which the boundary's influence is estimated without eigenpairs."""
@@ -156,7 +157,7 @@ def _influence(pairs: hj.Eigenpairs, times: tuple[float, ...]) -> np.ndarray | N
     if not is_known(pairs.pencil):
         return None
     t = times_of(pairs, times)
-    found, early = np.array(influence_of(pairs, t)), np.asarray(hj.truncation(pairs, t).tail) > EARLY
+    found, early = np.array(influence_of(pairs, t)), np.asarray(truncated_share(pairs, t)[0]) > EARLY
     if early.any():  # the eigenpairs do not resolve the signatures of the two problems
         found[early] = np.asarray(estimate_of(pairs, t[early]))
     return found

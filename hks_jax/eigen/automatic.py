@@ -86,7 +86,7 @@ def _host_called(n: int, k: int, dimension: int | None) -> bool:
     With several devices, XLA might call the host on each of them. JAX cannot store such a program in a cache.
     """
     alone = jax.default_backend() == "cpu" and jax.device_count() == 1
-    return n * k < _LARGE[dimension or 2] and alone and not jax.config.jax_compilation_cache_dir
+    return n * k < _LARGE[dimension or 2] and alone and not jax.config.values["jax_compilation_cache_dir"]
 
 
 def _in_jax(pencil: Pencil, k: int) -> Eigensolver:

@@ -15,7 +15,7 @@ from hks_jax.fem.elements import Quadrature
 from hks_jax.fem.fields import checked_field
 from hks_jax.fem.forms import Form, WeakForm, l2, laplace_beltrami
 from hks_jax.fem.integrals import assemble_grid, assemble_mesh, grid_points, mesh_nodes, mesh_points
-from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
+from hks_jax.fem.pencil import AnyPencil, MirrorPencil
 from hks_jax.fem.problems import problems_of
 from hks_jax.linear.operators import PatternedOperator, require_symmetric
 from hks_jax.traced import is_traced
@@ -191,7 +191,7 @@ def _assembled(
             name: value if callable(value) or np.shape(value)[:1] == at_vertices else domain.restrict(value)
             for name, value in given.items()
         }
-        pencil_on: Callable[..., Pencil] = partial(assemble_mesh, domain, nodes, midpoints is not None)
+        pencil_on = partial(assemble_mesh, domain, nodes, midpoints is not None)
     else:
         if not isinstance(domain, TensorField):
             raise TypeError(f"domain: got {type(domain).__name__}; expected a TensorField, a SurfaceMesh or a TetMesh")
@@ -203,14 +203,17 @@ def _assembled(
         if operator.components > 1 and "mirror" in str(boundary):
             raise ValueError('boundary: got "mirror" with components; only scalar functions support "mirror"')
         nodes, dtype = None, domain.tensors.dtype
-        points, pencil_on = partial(grid_points, domain.grid, dtype=dtype), partial(assemble_grid, domain)
-    spaces = problems_of(domain, boundary, degree)
+        points = partial(grid_points, domain.grid, dtype=dtype)
+    spaces: Any = problems_of(domain, boundary, degree)
     built_in, held = not operator.custom, {}
     for name, value in given.items():
         settings = {"scalar": built_in, "positive": built_in and name == "density"}
         held[name] = checked_field(name, value, spaces[0], partial(points, spaces[0]), dtype, **settings)
     operator = operator._replace(checked=built_in or not is_traced((domain, held, nodes)))
-    pencils = [pencil_on(held, each, operator) for each in spaces]
+    if isinstance(domain, TensorField):
+        pencils = assemble_grid(domain, held, spaces, operator)
+    else:
+        pencils = [pencil_on(held, each, operator) for each in spaces]
     if midpoints is not None and not is_traced(pencils) and np.isnan(pencils[0].mass.diagonal()).any():
         raise ValueError("midpoints: got positions that fold or invert cells; move them closer to the straight edges")
     if operator.custom and operator.checked:

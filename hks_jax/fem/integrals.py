@@ -31,10 +31,13 @@ from hks_jax.linear.linear_program import HostMap, linear_program
 from hks_jax.traced import is_traced
 
 
-def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace, operator: WeakForm) -> Pencil:
-    """Return the pencil of a field, or of one part of a doubled domain."""
-    # Masks, element and spacing are passed as arrays, so that problems that differ only in these arrays share one
+def assemble_grid(
+    field: TensorField, fields: dict[str, Field], spaces: list[GridSpace], operator: WeakForm
+) -> list[Pencil]:
+    """Return the pencil of a field for each space; the first space contains the functions of all spaces."""
+    # Masks, element and spacing are passed as arrays, so that fields that differ only in these arrays share one
     # compilation. The element is computed in double precision, since its rounding would scale the whole metric.
+    space = spaces[0]
     tensors, spacing, density = field.tensors, np.array(field.grid.spacing), None
     element = tensor_product_element(space.dimension)
     table = element.gradients / spacing, element.weights * spacing.prod(), spacing
@@ -45,15 +48,24 @@ def assemble_grid(field: TensorField, fields: dict[str, Field], space: GridSpace
     x = grid_points(field.grid, space, tensors.dtype) if operator.custom else None
     geometry = Geometry(domain, elements, couplings_for(tensors, space), gradients, weights, steps, x)
     settings = Settings(space.periodic, field.interpolation, operator)
-    *matrices, lumped, volume = _grid_integrals(settings, geometry, tensors, fields)
+    integrals = _grid_integrals(settings, geometry, tensors, fields)
     metric = SampledMetric(jax.lax.stop_gradient(field.tensors), steps, field.interpolation, operator.fick)
-    if operator.components > 1:
-        functions, kept = vector_space(space, operator.components), np.flatnonzero(space.elements)
-        one, other = (gathered(functions, each[kept]) for each in matrices)
-        sums = row_sums_of(functions, matrices[1][kept])
-        return assembled(one, other, sums, None, volume, None, functions, operator, fields)
-    stiffness, consistent = (StencilOperator(coefficients=each, space=space) for each in matrices)
-    return assembled(stiffness, consistent, lumped, metric, volume, density, space, operator, fields)
+
+    def pencil(space: GridSpace) -> Pencil:
+        *matrices, lumped, volume = integrals
+        if operator.components > 1:
+            functions, kept = vector_space(space, operator.components), np.flatnonzero(space.elements)
+            one, other = (gathered(functions, each[kept]) for each in matrices)
+            sums = row_sums_of(functions, matrices[1][kept])
+            return assembled(one, other, sums, None, volume, None, functions, operator, fields)
+        if space is not spaces[0]:
+            couplings = couplings_for(tensors, space)
+            assert couplings is not None
+            matrices = [jnp.where(couplings, each, 0) for each in matrices]
+        stiffness, consistent = (StencilOperator(coefficients=each, space=space) for each in matrices)
+        return assembled(stiffness, consistent, lumped, metric, volume, density, space, operator, fields)
+
+    return [pencil(each) for each in spaces]
 
 
 @numpy_where_known()

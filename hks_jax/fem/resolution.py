@@ -188,7 +188,7 @@ def _neighbours(xp: Any, domain: Any, axis: int, wraps: bool) -> Any:
     return pairs & (xp.arange(n) < n - 1).reshape([-1 if a == axis else 1 for a in range(domain.ndim)])
 
 
-@numpy_where_known(static_argnums=(2, 3, 4))
+@numpy_where_known(most=1 << 21, static_argnums=(2, 3, 4))
 def _of_grid(
     xp: Any, metric: SampledMetric, domain: Any, periodic: tuple[bool, ...], lumped: bool, cancelling: bool
 ) -> tuple[Any, ...]:

@@ -18,7 +18,8 @@ from hks_jax.eigen.weyl import weyl_count
 from hks_jax.fem.pencil import AnyPencil
 from hks_jax.signatures.hks import hks
 from hks_jax.signatures.kernels import heat_trace, wks
-from hks_jax.signatures.truncation import resolving, truncation, truncation_map
+from hks_jax.signatures.times import times_of
+from hks_jax.signatures.truncation import resolving, truncated_share, truncation_map
 
 TAIL = 1e-6
 """The share of the heat trace at the smallest time that may lie beyond the computed eigenpairs."""
@@ -85,7 +86,7 @@ def wave_kernel(sigma: float | Float[Array, ""]) -> Signature:
 
 
 def _tail(pairs: Eigenpairs, times: Any) -> Array:
-    return truncation(pairs, times).tail
+    return truncated_share(pairs, times_of(pairs, times))[0]
 
 
 SIGNATURES = {

@@ -19,7 +19,7 @@ from hks_jax.signatures.spectral_functions import (
     spectral_squared_distances,
 )
 from hks_jax.signatures.times import dimension_of, positive_range, volume_of
-from hks_jax.signatures.truncation import resolved_times, truncation
+from hks_jax.signatures.truncation import resolved_times, truncated_share
 from hks_jax.traced import is_traced
 
 
@@ -201,7 +201,7 @@ def _least_kernels(
         raise ValueError("pairs: got eigenpairs of unknown node spacing; expected a grid or linear elements")
     weights = jnp.where(pairs.kept[None], jnp.exp(-times[:, None] * pairs.eigenvalues[None]), 0)
     residuals = jnp.sum(weights * jnp.where(pairs.kept, pairs.residuals, 0)[None], axis=1) / jnp.sum(weights, axis=1)
-    error = MARGIN * truncation(pairs, times).tail + residuals + 100 * jnp.finfo(times.dtype).eps
+    error = MARGIN * truncated_share(pairs, times)[0] + residuals + 100 * jnp.finfo(times.dtype).eps
     at_nodes = jnp.where(space.free, jnp.square(resolution.mesh_width), 0)
     # The spacing along a geodesic is replaced by the larger of the mean spacing and the spacing at the geodesic's ends.
     along = jnp.maximum(

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.arrays import nan_is_meant, nan_outside
-from hks_jax.compilation import numpy_where_known
+from hks_jax.compilation import jit_quickly, numpy_where_known
 from hks_jax.domain.components import boundary_nodes
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
@@ -107,6 +107,7 @@ def estimate_of(pairs: Eigenpairs, times: Float[Array, " m"]) -> Float[Array, "m
     return _estimate(pairs.problems[0].pencil, rim_of(pairs.pencil), jax.lax.stop_gradient(times))
 
 
+@jit_quickly()
 def _share(neumann: Float[Array, "m *shape"], dirichlet: Float[Array, "m *shape"]) -> Float[Array, "m *shape"]:
     # Rounding of nearly equal signatures, or truncation of small signatures, may move the ratio out of [0, 1].
     return jnp.clip((neumann - dirichlet) / (neumann + dirichlet), 0, 1)
@@ -161,8 +162,13 @@ def _hitting(xp: Any, stiffness: Any, mass: Any, inner: Any, times: Any) -> Any:
 
 def free_share(influence: Float[Array | np.ndarray, "m *shape"], space: FunctionSpace) -> Float[Array, " m"]:
     """Return the share of the domain's nodes at which the boundary's influence is below `FREE`, at each time."""
-    free = (jnp.asarray(influence) < FREE).reshape(len(influence), -1)
-    return jnp.sum(free, axis=1, dtype=influence.dtype) / int(space.domain.sum())
+    return _free(jnp.asarray(influence)) / int(space.domain.sum())
+
+
+@jit_quickly()
+def _free(influence: Float[Array, "m *shape"]) -> Float[Array, " m"]:
+    """Return the number of nodes at which the boundary's influence is below `FREE`, at each time."""
+    return jnp.sum(influence < FREE, axis=tuple(range(1, influence.ndim)), dtype=influence.dtype)
 
 
 def half_free(pairs: Eigenpairs, first: Any, last: Any) -> Float[Array, ""]:
@@ -172,11 +178,20 @@ def half_free(pairs: Eigenpairs, first: Any, last: Any) -> Float[Array, ""]:
     """
     if not is_known(pairs.pencil) or not rim_of(pairs.pencil).any():
         return jnp.asarray(last)
-    times = jnp.geomspace(first, last, _CANDIDATES)
-    share = free_share(influence_of(pairs, times), pairs.space)
-    share = jax.lax.stop_gradient(jax.lax.cummin(share))
+    times = _candidates(first, last)
+    return _time_of_half(jax.lax.stop_gradient(free_share(influence_of(pairs, times), pairs.space)), times)
+
+
+@numpy_where_known()
+def _candidates(xp: Any, first: Any, last: Any) -> Any:
+    return xp.geomspace(first, last, _CANDIDATES, dtype=first.dtype)
+
+
+@numpy_where_known()
+def _time_of_half(xp: Any, share: Any, times: Any) -> Any:
+    share = np.minimum.accumulate(share) if xp is np else jax.lax.cummin(share)
     # The share decreases, so that the negative shares are ascending.
-    return jnp.exp(jnp.interp(-0.5, -share, jnp.log(times)))
+    return xp.exp(xp.interp(-0.5, -share, xp.log(times)))
 
 
 def _glued(domain: TensorField | SimplicialMesh, boundary: BoundarySpec) -> BoundarySpec:

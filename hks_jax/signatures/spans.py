@@ -10,7 +10,7 @@ from hks_jax.checks import require_count, require_number
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.rim import half_free
 from hks_jax.signatures.times import RESOLVED, dimension_of, positive_range
-from hks_jax.signatures.truncation import truncation
+from hks_jax.signatures.truncation import truncated_share
 
 SHORTEST = 2.0
 """The least ratio of the last to the first default time: nearer times give nearly equal signatures."""
@@ -50,7 +50,7 @@ def resolved_span(pairs: Eigenpairs, n: int) -> Float[Array, " n"]:
     """
     last = positive_range(pairs)[1]
     first = RESOLVED[dimension_of(pairs, "default times")] / last
-    return _spaced(pairs, jnp.maximum(first, truncation(pairs, first[None]).smallest_time), (math.pi / 3) ** 2, n)
+    return _spaced(pairs, jnp.maximum(first, truncated_share(pairs, first[None])[1]), (math.pi / 3) ** 2, n)
 
 
 def _spaced(pairs: Eigenpairs, first: Array, product: float, n: int) -> Float[Array, " n"]:

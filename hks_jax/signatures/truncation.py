@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Real
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.arrays import describe_array, nan_is_meant
-from hks_jax.compilation import numpy_where_known
+from hks_jax.compilation import jit_quickly, numpy_where_known
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.resolution import Resolution
 from hks_jax.fem.space import mask_for
@@ -28,6 +28,8 @@ from hks_jax.traced import is_traced
 
 TAIL_LIMIT = 0.01
 BIAS_LIMIT = 0.1
+_MANY = 1 << 22
+"""The largest total number of nodal values for which NumPy takes less time than one compilation."""
 
 
 class Truncation(eqx.Module):
@@ -123,28 +125,33 @@ def truncation(pairs: Eigenpairs, times: Sequence[float] | Real[ArrayLike, " n"]
         [False  True]
     """
     pairs, at = jax.lax.stop_gradient((pairs, times_of(pairs, times)))
+    tail, smallest_time, moments = _of_spectrum(pairs, at)
+    resolution = pairs.pencil.resolution if pairs.null_space_known else None
+    if resolution is None:
+        unknown = jnp.full_like(at, jnp.nan)
+        return Truncation(at, tail, unknown, unknown, unknown, smallest_time, unknown[0])
+    free = mask_for((at, pairs.eigenvalues), pairs.space.free)
+    bias, lasting, coarse, resolved = _of_nodes(resolution, free, at, moments, pairs.space.dimension)
+    return Truncation(at, tail, bias, lasting, coarse, smallest_time, resolved, order=resolution.order)
+
+
+def truncated_share(pairs: Eigenpairs, times: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+    """Return `tail` and `smallest_time` of `truncation`, which do not depend on the nodes and take less time."""
+    tail, smallest_time, _ = _of_spectrum(*jax.lax.stop_gradient((pairs, times)))
+    return tail, smallest_time
+
+
+def _of_spectrum(pairs: Eigenpairs, at: Float[Array, " n"]) -> tuple[Any, ...]:
+    dimension = dimension_of(pairs, "an estimate of the truncation")
     known = pairs.eigenvalues, pairs.kept, pairs.next_eigenvalue, pairs.spectral_origin
-    dimension, resolution = dimension_of(pairs, "an estimate of the truncation"), pairs.pencil.resolution
-    by_weyl = pairs.null_space_known
-    if not by_weyl:
-        resolution = None
-    free, order = mask_for(known, pairs.space.free), 1 if resolution is None else resolution.order
-    return Truncation(at, *_truncation(resolution, free, *known, at, dimension, by_weyl), order=order)
+    return _of_eigenvalues(*known, at, dimension, pairs.null_space_known)
 
 
-@numpy_where_known(static_argnums=(7, 8))
-def _truncation(
-    xp: Any,
-    resolution: Resolution | None,
-    free: Any,
-    values: Any,
-    kept: Any,
-    next_eigenvalue: Any,
-    bottom: Any,
-    at: Any,
-    dimension: int,
-    by_weyl: bool,
+@numpy_where_known(static_argnums=(5, 6))
+def _of_eigenvalues(
+    xp: Any, values: Any, kept: Any, next_eigenvalue: Any, bottom: Any, at: Any, dimension: int, by_weyl: bool
 ) -> tuple[Any, ...]:
+    """Return `tail`, `smallest_time` and, if the spectrum follows Weyl's law, the moments for `_resolution_bias`."""
     # Weyl's law counts from the bottom of the spectrum, which a potential shifts.
     values, next_eigenvalue = values - bottom, next_eigenvalue - bottom
     complete = xp.isinf(next_eigenvalue)
@@ -163,18 +170,29 @@ def _truncation(
     terms = xp.where(kept[None], xp.exp(-exponents), 0)
     tail = xp.where(complete, 0, left / (left + xp.sum(terms, axis=1)))
     smallest = xp.where(complete, 0, least / following)
-    if resolution is None:
-        unknown = xp.full_like(at, xp.nan)
-        return tail, unknown, unknown, unknown, smallest, unknown[0]
+    if not by_weyl:
+        return tail, smallest, None
     end = xp.maximum(xp.where(complete, last, next_eigenvalue), xp.finfo(at.dtype).tiny)
-    moments = _moments(xp, exponents, terms, count, end * at, dimension)
-    bias, lasting = _resolution_bias(xp, resolution, free, at, moments, dimension)
+    return tail, smallest, _moments(xp, exponents, terms, count, end * at, dimension)
+
+
+@numpy_where_known(most=_MANY, static_argnums=4)
+def _of_nodes(
+    xp: Any, resolution: Resolution, free: Any, at: Any, moments: list[Any], dimension: int
+) -> tuple[Any, ...]:
+    """Return `resolution_bias`, `lasting_bias`, `coarse_fraction` and `smallest_resolved` of `Truncation`."""
+    nodal: tuple[Any, ...] = (resolution.dispersion, resolution.of_eigenvalues, resolution.turning)
+    if xp is np:  # The sizes of a compiled program cannot depend on the mask.
+        nodal, free = tuple(x[free] for x in nodal), free[free]
+    else:
+        nodal, free = tuple(xp.where(free, x, 0).ravel() for x in nodal), free.ravel()
+    bias, lasting = _resolution_bias(xp, resolution, nodal, free, at, moments, dimension)
     coarse = xp.sum(bias > BIAS_LIMIT, axis=1, dtype=at.dtype) / xp.sum(free, dtype=at.dtype)
-    early, _ = _resolution_bias(xp, resolution, free, at[:1], [xp.ones((1,), at.dtype)] * 3, dimension)
+    early, _ = _resolution_bias(xp, resolution, nodal, free, at[:1], [xp.ones((1,), at.dtype)] * 3, dimension)
     share = median_of_shares(xp, early, free)[0]
     resolved = at[0] * (_odds(share) / _odds(BIAS_LIMIT)) ** (1 / resolution.order)
     medians = (median_of_shares(xp, each, free) for each in (bias, lasting))
-    return tail, *medians, coarse, smallest, resolved
+    return *medians, coarse, resolved
 
 
 # The heat trace of a continuous metric is Z(t) = Σ e^(−λt), to which the eigenvalues beyond the pairs contribute as in
@@ -209,15 +227,15 @@ def _moments(xp: Any, exponents: Any, terms: Any, count: Any, x: Any, dimension:
 #
 #     c = (2/d)(d − 1) a(t|ξ|²),    a(x) = ∫₀¹ (1 + x (1 − s)²) exp(−x s (1 − s)) ds − 1 ≤ a(5.54) = 0.32.
 def _resolution_bias(
-    xp: Any, resolution: Resolution, free: Any, times: Any, moments: list[Any], d: int
+    xp: Any, resolution: Resolution, nodal: tuple[Any, ...], free: Any, times: Any, moments: list[Any], d: int
 ) -> tuple[Any, Any]:
-    """Return the estimated relative discretisation error (times, nodes), and its part that does not decrease with t."""
+    """Return the estimated relative discretisation error (times, nodes), and its part that does not decrease with t.
+
+    The arrays of ``nodal`` are the dispersion, the part of the eigenvalues and the turning (nodes,), 0 at fixed nodes.
+    """
     first, second, third = (each[:, None] for each in moments)
     order, t = resolution.order, times[:, None]
-    dispersion, of_eigenvalues, turning = (
-        xp.where(free, x, 0).ravel()[None]
-        for x in (resolution.dispersion, resolution.of_eigenvalues, resolution.turning)
-    )
+    dispersion, of_eigenvalues, turning = (x[None] for x in nodal)
     uneven = _LARGEST_CHANGE * (2 / d) * (d - 1) * xp.maximum(first, 1) * resolution.unevenness
     # Moments below 1 are those of the computed eigenvalues, which may be much too large on a coarse grid.
     decreasing = xp.maximum(first if order == 1 else third, 1) * (dispersion / t) ** order
@@ -225,7 +243,7 @@ def _resolution_bias(
     # Between Dirichlet sides few eigenvalues remain at large t, where their relative errors, times t, grow.
     grows = second > 2
     lasting = first * turning + xp.abs(1 - first) * resolution.swelling + uneven + xp.where(grows, of_spacing, 0)
-    lasting = xp.where(free.ravel()[None], lasting, 0)
+    lasting = xp.where(free[None], lasting, 0)
     both = xp.hypot(xp.where(grows, 0, of_spacing), lasting)
     # The signature of the discretised domain stays bounded as t tends to 0, so its relative error tends to 1.
     return both / (1 + both), lasting / (1 + lasting)
@@ -242,8 +260,12 @@ def _odds(share: Any) -> Any:
 def median_of_shares(xp: Any, x: Any, free: Any) -> Any:
     """Return the median over the free nodes of each row of x (n, nodes), whose entries are in [0, 1], and 0 elsewhere.
 
-    The accuracy is 1e-12. The median of a row with a NaN is NaN. Bisection is ten times as fast as sorting in JAX.
+    The accuracy is 1e-12. The median of a row with a NaN is NaN. In JAX, bisection is ten times as fast as sorting.
     """
+    if xp is np:
+        known = x[:, free.ravel()]
+        middle = (known.shape[1] - 1) // 2
+        return np.where(np.isnan(known).any(axis=1), np.nan, np.partition(known, middle, axis=1)[:, middle])
     twice_half = 2 * free.size - xp.sum(free)
 
     def halve(_: Any, ends: tuple[Any, Any]) -> tuple[Any, Any]:
@@ -360,7 +382,7 @@ def truncation_map(
     return _map(*jax.lax.stop_gradient((pairs, times_of(pairs, times))))
 
 
-@jax.jit
+@jit_quickly()
 def _map(pairs: Eigenpairs, at: Float[Array, " n"]) -> Float[Array, "n *shape"]:
     dtype, bottom = at.dtype, pairs.spectral_origin
     pairs = pairs.with_problems(

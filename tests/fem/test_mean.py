@@ -10,6 +10,7 @@ from scipy.spatial import Delaunay
 import hks_jax as hj
 from hks_jax.eigen import all_pencils
 from hks_jax.eigen.one_pencil import pairs_of_pencil
+from hks_jax.fem.boundary import doubled_problems, normalise_boundary
 
 RIM_COEFFICIENT = np.sqrt(np.pi) / 4
 """4πt·HKS is 1 + this times κ√t on a rim of curvature κ."""
@@ -278,3 +279,19 @@ def test_pairs_that_are_shapes_or_tangents(rng):
             _ = wrong.eigenvalues
     change = jax.jvp(lambda x: pairs(x).eigenvalues, (tensors,), (tensors,))[1]  # λ of the metric cT is λ/c
     np.testing.assert_allclose(change, -both[0].eigenvalues, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(9, 8), (6, 5, 7)])
+def test_problems_that_are_integrated_together_are_those_assembled_alone(rng, shape):
+    field = masked_field(rng, shape)
+    together = hj.assemble(field, "mean").parts
+    compiled = jax.jit(lambda T: hj.assemble(field.with_tensors(T), "mean"))(field.tensors).parts  # by XLA, not NumPy
+    problems = doubled_problems(normalise_boundary("mean", len(shape)))
+    assert len(together) == len(problems) == 2
+    for boundary, *pair in zip(problems, together, compiled, strict=True):
+        alone = hj.assemble(field, boundary)
+        for each in pair:
+            for name in ("stiffness", "mass"):
+                one, other = (np.asarray(getattr(pencil, name).to_dense()) for pencil in (each, alone))
+                np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-13)
+            np.testing.assert_allclose(each.volume, alone.volume, rtol=1e-12)

@@ -154,7 +154,12 @@ def cheap(monkeypatch):
             values = np.where(domain.grid.inside, 2 + np.sin(domain.grid.nodes).sum(axis=-1), np.nan)
         return np.stack([values / t for t in times])
 
+    def cheap_with_rim(field, times, k):
+        values = 1 + 0.1 * cheap_signature(field, np.ones(len(times)), k)
+        return values, np.where(np.isfinite(values), 0.0, np.nan)
+
     monkeypatch.setattr(figures, "signature", cheap_signature)
+    monkeypatch.setattr(figures, "signature_and_influence", cheap_with_rim)
     monkeypatch.setattr(figures, "flat_signature", lambda f, t, b="neumann": cheap_signature(f, [t], 1)[0])
     monkeypatch.setattr(figures, "continued_signature", lambda f, t, d: cheap_signature(f, [t], 1)[0])
     monkeypatch.setattr(figures, "hks_expansion", lambda f, t: cheap_signature(f, t, 1))
@@ -195,14 +200,35 @@ def one_colour_range(images):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("cheap")
-def test_figure_6_draws_a_phantom_where_there_is_no_brain(tmp_path, drawn, monkeypatch):
-    monkeypatch.setattr(figures, "find_example_brain", lambda: None)
+def test_figure_6_draws_the_brain_beside_its_anatomy(tmp_path, drawn, monkeypatch):
+    pytest.importorskip("dipy")
+    if figures.find_example_brain() is None:
+        pytest.skip("the brain is not installed")
     fig = draw("figure6", tmp_path, drawn, monkeypatch)
-    assert len(fig.axes) == 10
-    assert "phantom" in fig.get_suptitle()
-    for ax in fig.axes:
+    panels = np.reshape(fig.axes, (2, 5))
+    for ax in panels.flat:
         image = ax.images[0].get_array()
         assert 0.3 < image.count() / image.size < 0.95  # nothing outside the mask
+        assert {text.get_text() for text in ax.texts} == set("LRAP")
+    assert [ax.get_title().split("\n")[0] for ax in panels[0]] == ["mean diffusivity", "5 mm", "7 mm", "10 mm", "14 mm"]
+    assert [ax.get_ylabel() for ax in panels[:, 0]] == [ax.get_xlabel() for ax in panels[1, :2]] == ["mm", "mm"]
+    for ax in panels[:, 1:].flat:
+        assert "HKS" in ax.child_axes[0].get_ylabel()
+        assert np.mean(ax.images[0].get_clim()) == pytest.approx(1)  # the middle colour is that of a flat metric
+
+
+@pytest.mark.parametrize("lacking", ["brain", "dipy"])
+def test_figure_6_is_skipped_where_there_is_no_brain(lacking, tmp_path, monkeypatch):
+    lines = []
+    if lacking == "brain":
+        monkeypatch.setattr(figures, "find_example_brain", lambda: None)
+    else:
+        monkeypatch.setattr(figures, "find_example_brain", lambda: ())
+        monkeypatch.setattr(figures.importlib.util, "find_spec", lambda name: None)
+    assert run(tmp_path, False, ["figure6"], lines.append) == []
+    (line,) = lines
+    assert "skipped" in line
+    assert "mdt==1.2.7" in line
 
 
 @pytest.mark.slow

@@ -226,7 +226,7 @@ def test_truncation_map_finds_the_worst_node(rng, shape, boundary, spread):
 
 @pytest.mark.parametrize("xp", [np, jnp])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_medians_by_bisection_are_those_of_sorting(rng, dtype, xp):
+def test_medians_are_those_of_sorting(rng, dtype, xp):
     shares = np.concatenate([rng.uniform(0, 1, (3, 41)), np.zeros((1, 41)), np.ones((1, 41))]).astype(dtype)
     free = np.arange(60) % 3 != 1  # 40 of 60; the others count as zero
     padded = np.zeros((5, 60), dtype)

@@ -145,7 +145,8 @@ def _iterate(
     rounds = _FIRST_ROUNDS
     while grids:
         for _ in range(rounds):
-            state = grid.improve(rounding, state)
+            # The programs of `improve_told` serve the grid's beginning too, and one of them both problems of "mean".
+            state = grid.improve_told(rounding, state) if plan.mesh is None else grid.improve(rounding, state)
         if not is_traced(state):
             report(f"grid {' × '.join(map(str, grid.pencil.shape))}")
         coarse, grid, rounds = grid, grids.pop(), _COARSE_ROUNDS

@@ -1,7 +1,6 @@
 """Rounds of subspace iteration: a Chebyshev filter, followed by a Rayleigh–Ritz projection."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -22,6 +21,7 @@ from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.halo import Slabs
 from hks_jax.fem.nodal import NodalPencil, to_rows
 from hks_jax.linear.accelerators import row_by_row
+from hks_jax.linear.chebyshev import Columns
 from hks_jax.linear.loops import for_each
 from hks_jax.linear.products import aligned
 
@@ -47,6 +47,8 @@ _MOST_TERMS = 15
 
 Number = Int[Array, ""]
 Values = Float[Array, " m"]
+Rows = Float[Array, "m nodes"]
+"""All vectors; each of several devices has a slab of them."""
 OwnRows = Float[Array, "own nodes"]
 """The vectors that this device filters, on all nodes of the grid."""
 
@@ -84,6 +86,16 @@ class Filtering(NamedTuple):
     allowed: Values  # the residual up to which each vector counts as converged; blocks of such vectors are not filtered
 
 
+class Block(NamedTuple):
+    """Some vectors that are filtered together, with their entries of `Filtering`."""
+
+    vectors: Columns
+    values: Float[Array, " b"]
+    factor: Float[Array, " b"]
+    allowed: Float[Array, " b"]
+    degree: Number
+
+
 class GridFilter(eqx.Module):
     """Subspace iteration on one grid. All grids of one shape share the compiled functions."""
 
@@ -96,7 +108,7 @@ class GridFilter(eqx.Module):
         """The parts of the grid on which several devices store vectors between two rounds; None on one device."""
         return self.pencil.cut(self.plan.mesh)
 
-    @jax.jit
+    @jit_quickly()
     def excess(self, rounding: Scalar, state: FilterState) -> Values:
         """Return the residuals as multiples of the largest residuals that count as converged."""
         return state.residuals / self._allowed(rounding, state.values)
@@ -110,13 +122,16 @@ class GridFilter(eqx.Module):
     def _spare(self) -> Bool[np.ndarray, " m"]:
         return np.arange(self.plan.size) >= self.plan.wanted
 
-    @jit_quickly()
     def from_random(self, volume: Scalar) -> FilterState:
         """Return the state after filtering random functions."""
+        return self._begin(self._random(volume))
+
+    @jit_quickly()
+    def _random(self, volume: Scalar) -> Rows:
         plan, shape, dtype = self.plan, self.pencil.shape, self.high.dtype
         low = jnp.minimum(1.3 * weyl(plan.size, volume, len(shape)).astype(dtype), self.high / 3)
 
-        def run(grid: GridFilter, low: Scalar) -> FilterState:
+        def run(grid: GridFilter, low: Scalar) -> Rows:
             pencil, band = grid.pencil, Band(low, grid.high)
             degree = jnp.ceil(band.degree_for(jnp.zeros_like(low), _SPREAD)).astype(int)
 
@@ -127,36 +142,45 @@ class GridFilter(eqx.Module):
 
             numbers = subspace.own_blocks(grid.slabs, plan.size // plan.block)
             keys = jax.random.split(jax.random.key(0), plan.size // plan.block)[numbers]
-            return grid._begin(jax.lax.map(damped, keys).reshape(-1, pencil.free.size))
+            own = jax.lax.map(damped, keys).reshape(-1, pencil.free.size)
+            return subspace.to_slabs(grid.slabs, plan.block, own)
 
-        return subspace.shared(self.slabs, run, EVERYWHERE, _layout(self.slabs))(self, low)
+        return subspace.shared(self.slabs, run, EVERYWHERE, _layout(self.slabs).vectors)(self, low)
+
+    def from_rows(self, rows: Rows) -> FilterState:
+        """Return the state in the span of functions on the whole grid."""
+        return self._begin(self._dealt(rows))
 
     @jit_quickly()
-    def from_rows(self, rows: Float[Array, "m nodes"]) -> FilterState:
-        """Return the state in the span of functions on the whole grid."""
+    def _dealt(self, rows: Rows) -> Rows:
         plan, layout = self.plan, _layout(self.slabs)
 
-        def run(grid: GridFilter, rows: Float[Array, "m nodes"]) -> FilterState:
+        def run(grid: GridFilter, rows: Rows) -> Rows:
             numbers = subspace.own_blocks(grid.slabs, plan.size // plan.block)
-            return grid._begin(rows.reshape(-1, plan.block, rows.shape[1])[numbers].reshape(-1, rows.shape[1]))
+            own = rows.reshape(-1, plan.block, rows.shape[1])[numbers].reshape(-1, rows.shape[1])
+            return subspace.to_slabs(grid.slabs, plan.block, own)
 
-        return subspace.shared(self.slabs, run, (EVERYWHERE, EVERYWHERE), layout)(self, rows)
+        return subspace.shared(self.slabs, run, (EVERYWHERE, EVERYWHERE), layout.vectors)(self, rows)
 
-    @jit_quickly()
     def from_coarse(self, coarse: "GridFilter", state: FilterState) -> FilterState:
         """Return the state interpolated from the next coarser grid."""
+        return self._begin(self._interpolated(coarse, state.vectors))
+
+    @jit_quickly()
+    def _interpolated(self, coarse: "GridFilter", vectors: Float[Array, "m coarse_nodes"]) -> Rows:
         slabs, shape, block = coarse.slabs, coarse.pencil.shape, self.plan.block
 
-        def run(grid: GridFilter, vectors: Float[Array, "m coarse_nodes"]) -> FilterState:
+        def run(grid: GridFilter, vectors: Float[Array, "m coarse_nodes"]) -> Rows:
             rows = subspace.to_own_rows(slabs, block, vectors)
 
             def of_block(number: Array) -> Float[Array, "b nodes"]:
                 return to_rows(interpolate(grid.pencil, subspace.block_of(rows, number, block, shape)))
 
-            return grid._begin(jax.lax.map(of_block, jnp.arange(len(rows) // block)).reshape(len(rows), -1))
+            own = jax.lax.map(of_block, jnp.arange(len(rows) // block)).reshape(len(rows), -1)
+            return subspace.to_slabs(grid.slabs, block, own)
 
-        layout = _layout(self.slabs)
-        return subspace.shared(self.slabs, run, (EVERYWHERE, layout.vectors), layout)(self, state.vectors)
+        layout = _layout(self.slabs).vectors
+        return subspace.shared(self.slabs, run, (EVERYWHERE, layout), layout)(self, vectors)
 
     def improve_told(
         self, rounding: Scalar, state: FilterState, done: Callable[[int, int], Any] | None = None
@@ -168,7 +192,7 @@ class GridFilter(eqx.Module):
         """
         slabs, plan, layout = self.slabs, self.plan, _layout(self.slabs)
 
-        def run(grid: GridFilter, rounding: Scalar, state: FilterState) -> FilterState:
+        def run(grid: GridFilter, rounding: Scalar, state: FilterState) -> tuple[Rows, Number]:
             numbers = subspace.own_blocks(slabs, plan.size // plan.block)
             chosen = grid.choose(rounding, state)
 
@@ -183,13 +207,15 @@ class GridFilter(eqx.Module):
 
             own_rows = subspace.to_own_rows(slabs, plan.block, state.vectors)
             filtered = for_each(_PASSES * numbers.size, step, own_rows)
-            return grid.ritz(subspace.to_slabs(slabs, plan.block, filtered), chosen.terms, state.rounds + 1)
+            return subspace.to_slabs(slabs, plan.block, filtered), chosen.terms
 
-        return subspace.shared(slabs, run, (EVERYWHERE, EVERYWHERE, layout), layout)(self, rounding, state)
+        ends = layout.vectors, EVERYWHERE
+        vectors, terms = subspace.shared(slabs, run, (EVERYWHERE, EVERYWHERE, layout), ends)(self, rounding, state)
+        return self.ritz(vectors, terms, state.rounds + 1)
 
     improve = jax.jit(improve_told, donate_argnames="state")
 
-    @jax.jit
+    @jit_quickly()
     def choose(self, rounding: Scalar, state: FilterState) -> Filtering:
         """Return the polynomials of a round: the band that they damp, the degree for each block, and further data."""
         plan = self.plan
@@ -206,48 +232,68 @@ class GridFilter(eqx.Module):
         degrees = jnp.max(degrees.reshape(-1, plan.block), axis=1).astype(int)
         return Filtering(band, terms, degrees, filtered_values, factor, self._allowed(rounding, state.values))
 
-    @partial(jax.jit, donate_argnames="vectors")
     def filter_block(self, chosen: Filtering, number: Number, own: Number, vectors: OwnRows) -> OwnRows:
         """Filter the block of vectors with index ``number`` among all blocks and ``own`` among this device's blocks."""
-        pencil, block = self.pencil, self.plan.block
-        x = subspace.block_of(vectors, own, block, pencil.shape)
-        zeta, scale, allowed = (
+        block = self._block(chosen, number, own, vectors)
+        return self._plus(_change(self.pencil, chosen.band, chosen.terms, block), own, vectors)
+
+    @jit_quickly()
+    def _block(self, chosen: Filtering, number: Number, own: Number, vectors: OwnRows) -> Block:
+        block = self.plan.block
+        values, factor, allowed = (
             jax.lax.dynamic_slice_in_dim(of_all, number * block, block)
             for of_all in (chosen.values, chosen.factor, chosen.allowed)
         )
+        x = subspace.block_of(vectors, own, block, self.pencil.shape)
+        return Block(x, values, factor, allowed, chosen.degrees[number])
 
-        def total(terms: Float[Array, "*shape b"]) -> Float[Array, " b"]:
-            return jnp.sum(terms, tuple(range(terms.ndim - 1)))
-
-        image, moved = pencil.products()(x)
-        residual = image - aligned(total(x * image) / total(x * moved), x) * moved
-        left = ~(total(residual**2) <= allowed**2 * total(moved**2))
-
-        def filtered(image: Float[Array, "*shape b"], residual: Float[Array, "*shape b"]) -> Float[Array, "*shape b"]:
-            # If the quotient ζ of x is in the damped band, the residual is large, and the polynomial is applied to x.
-            inside = aligned(zeta > chosen.band.low, x)
-            of_residual = jnp.where(inside, image, residual).astype(jnp.float32)
-            whole = jnp.where(inside, x, 0).astype(jnp.float32)
-            degree = chosen.degrees[number]
-            z = correction(pencil, chosen.band, of_residual, zeta, degree, whole, chosen.terms)
-            return jnp.where(inside, 1, aligned(jnp.clip(scale, 0, 1), x)) * z.astype(x.dtype)
-
-        z = jax.lax.cond(jnp.any(left), filtered, lambda *_: jnp.zeros_like(x), image, residual)
-        rows = row_by_row(jax.lax.dynamic_slice_in_dim(vectors, own * block, block)) + row_by_row(to_rows(z))
+    @jit_quickly(donate_argnames="vectors")
+    def _plus(self, change: Columns, own: Number, vectors: OwnRows) -> OwnRows:
+        block = self.plan.block
+        rows = row_by_row(jax.lax.dynamic_slice_in_dim(vectors, own * block, block)) + row_by_row(to_rows(change))
         return jax.lax.dynamic_update_slice_in_dim(vectors, rows, own * block, axis=0)
 
-    @partial(jax.jit, donate_argnames="vectors")
-    def ritz(self, vectors: Float[Array, "m nodes"], terms: Number, rounds: Number) -> FilterState:
+    @jit_quickly(donate_argnames="vectors")
+    def ritz(self, vectors: Rows, terms: Number, rounds: Number) -> FilterState:
         """Return the state with the Ritz vectors of the subspace that the given vectors span."""
-        slabs, block = self.slabs, self.plan.block
-        own = self.pencil.own(slabs)
-        values, vectors = subspace.rayleigh_ritz(own, slabs, block, vectors)
-        residuals, lumped_values = subspace.measured(own, slabs, block, values, vectors)
-        return FilterState(values, vectors, residuals, lumped_values, terms, rounds)
+        slabs, block, layout = self.slabs, self.plan.block, _layout(self.slabs)
 
-    def _begin(self, rows: OwnRows) -> FilterState:
+        def run(grid: GridFilter, vectors: Rows, terms: Number, rounds: Number) -> FilterState:
+            own = grid.pencil.own(slabs)
+            values, vectors = subspace.rayleigh_ritz(own, slabs, block, vectors)
+            residuals, lumped_values = subspace.measured(own, slabs, block, values, vectors)
+            return FilterState(values, vectors, residuals, lumped_values, terms, rounds)
+
+        given = EVERYWHERE, layout.vectors, EVERYWHERE, EVERYWHERE
+        return subspace.shared(slabs, run, given, layout)(self, vectors, terms, rounds)
+
+    def _begin(self, vectors: Rows) -> FilterState:
         zero = jnp.zeros((), int)
-        return self.ritz(subspace.to_slabs(self.slabs, self.plan.block, rows), zero, zero)
+        return self.ritz(vectors, zero, zero)
+
+
+# The program is the same for every number of vectors, such as those of both problems of "mean".
+@jax.jit
+def _change(pencil: NodalPencil, band: Band, terms: Number, block: Block) -> Columns:
+    """Return what the filter adds to the vectors of a block."""
+    x, zeta, scale, allowed, degree = block
+
+    def total(terms: Columns) -> Float[Array, " b"]:
+        return jnp.sum(terms, tuple(range(terms.ndim - 1)))
+
+    image, moved = pencil.products()(x)
+    residual = image - aligned(total(x * image) / total(x * moved), x) * moved
+    left = ~(total(residual**2) <= allowed**2 * total(moved**2))
+
+    def filtered(image: Columns, residual: Columns) -> Columns:
+        # If the quotient ζ of x is in the damped band, the residual is large, and the polynomial is applied to x.
+        inside = aligned(zeta > band.low, x)
+        of_residual = jnp.where(inside, image, residual).astype(jnp.float32)
+        whole = jnp.where(inside, x, 0).astype(jnp.float32)
+        z = correction(pencil, band, of_residual, zeta, degree, whole, terms)
+        return jnp.where(inside, 1, aligned(jnp.clip(scale, 0, 1), x)) * z.astype(x.dtype)
+
+    return jax.lax.cond(jnp.any(left), filtered, lambda *_: jnp.zeros_like(x), image, residual)
 
 
 def _lumping(plan: FilterPlan, state: FilterState) -> tuple[Number, Values, Values]:
