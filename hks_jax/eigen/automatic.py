@@ -77,10 +77,10 @@ def choose_for_fit(pencil: AnyPencil, k: int) -> Eigensolver:
     n, adjoint = pencil.space.n_dof, FactorisedAdjoint(1e-5, solves=20)
     if n <= _SMALL or k + 20 > BlockLanczos().max_pairs(n):
         return Dense()
-    return (ShiftInvert if _host_called(n, k, pencil.space.dimension) else BlockLanczos)(adjoint=adjoint)
+    return (ShiftInvert if _calls_host(n, k, pencil.space.dimension) else BlockLanczos)(adjoint=adjoint)
 
 
-def _host_called(n: int, k: int, dimension: int | None) -> bool:
+def _calls_host(n: int, k: int, dimension: int | None) -> bool:
     """Return whether a program under `jax.jit` calls the host for eigenpairs.
 
     With several devices, XLA might call the host on each of them. JAX cannot store such a program in a cache.
@@ -105,7 +105,7 @@ def _automatic(pencil: Pencil, k: int) -> Eigensolver:
         return Dense()
     known = is_concrete_on_cpu(jax.lax.stop_gradient((pencil.stiffness, pencil.mass)))
     # Under `jit`, a second solver cannot follow if shift-invert leaves doubt, as it may without a lower bound.
-    if not (n * k < _LARGE[dimension or 2] if known else _host_called(n, k, dimension) and pencil.bounded):
+    if not (n * k < _LARGE[dimension or 2] if known else _calls_host(n, k, dimension) and pencil.bounded):
         return _in_jax(pencil, k)
     # Derivatives in JAX take half of the time, except in 3D and in float32, but several seconds of compilation.
     in_jax = (not known or n * k >= _DIFFERENTIATED_IN_JAX) and pencil.stiffness.dtype == np.float64 and dimension != 3

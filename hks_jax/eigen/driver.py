@@ -43,8 +43,8 @@ def eigenpairs(
         k: the number of pairs, from 1 to the number of degrees of freedom. `count_eigenvalues` gives the k of all
             eigenvalues below a number.
         boundary: the boundary condition of a field or mesh; see `assemble`.
-        solver: ``"auto"`` (a choice by size, but never a solver on the host under `jit`, `vmap` or on accelerators),
-            ``"dense"``, ``"shift-invert"`` (on the host), ``"block-lanczos"`` (mainly for 2D and surfaces),
+        solver: ``"auto"`` (a choice by size; for accelerators, stored programs and several devices never a solver on
+            the host), ``"dense"``, ``"shift-invert"`` (on the host), ``"block-lanczos"`` (mainly for 2D and surfaces),
             ``"chebyshev-filter"`` (for grids, mainly in 3D), or a solver object such as
             ``hks_jax.BlockLanczos(tolerance=1e-6)``. The result names the solver in ``.solver_name``. The Chebyshev
             filter needs a stiffness that is not indefinite.

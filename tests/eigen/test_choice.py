@@ -1,5 +1,6 @@
 """What "auto" chooses, and what it chooses under jit: on one CPU a solver on the host, elsewhere none."""
 
+from contextlib import contextmanager
 from functools import partial
 
 import jax
@@ -88,6 +89,17 @@ def test_who_asks_for_shift_invert_gets_it_under_jit():
     assert "pure_callback" in set(primitives(jaxpr.jaxpr))
 
 
+@contextmanager
+def programs_in(folder):
+    """Let JAX store compiled programs in a folder, or nowhere, as users have it."""
+    before = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", folder)
+    try:
+        yield
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
+
+
 @pytest.mark.parametrize(
     ("shape", "dtype", "adjoint"),
     [
@@ -105,10 +117,26 @@ def test_under_jit_on_one_cpu_the_host_computes_the_pairs(monkeypatch, shape, dt
         return tensors
 
     tensors = jnp.broadcast_to(jnp.eye(len(shape), dtype=dtype), (*shape, len(shape), len(shape)))
-    jax.make_jaxpr(partial(choose, hj.assemble))(tensors)
-    jax.make_jaxpr(partial(choose, hj.assemble_forms))(tensors)  # without a lower bound, it may leave doubt
+    with programs_in(None):
+        jax.make_jaxpr(partial(choose, hj.assemble))(tensors)
+        jax.make_jaxpr(partial(choose, hj.assemble_forms))(tensors)  # without a lower bound, it may leave doubt
     assert (chosen[0].name, type(chosen[0].adjoint)) == ("shift-invert", adjoint)
     assert chosen[1].name != "shift-invert"
+
+
+def test_programs_that_jax_stores_do_not_call_the_host(tmp_path):
+    def chosen(folder):
+        def choose(tensors):
+            names.append(choose_solver("auto", hj.assemble(hj.TensorField(hj.Grid((42, 41)), tensors)), 5).name)
+            return tensors
+
+        names = []
+        with programs_in(folder):
+            jax.make_jaxpr(choose)(jnp.broadcast_to(jnp.eye(2), (42, 41, 2, 2)))
+        return names
+
+    assert chosen(None) == ["shift-invert"]
+    assert chosen(str(tmp_path)) == ["block-lanczos"]
 
 
 @pytest.mark.slow
@@ -165,8 +193,9 @@ def test_on_accelerators_nothing_runs_on_the_host(monkeypatch):
 
 def test_fits_reuse_factorisations_in_jax(monkeypatch):
     pencil = hj.assemble(flat((42, 41), (1.0, 1.0)))
-    assert [choose_for_fit(pencil, k).name for k in (20, 420)] == ["shift-invert", "dense"]
-    assert choose_for_fit(pencil, 20).adjoint == hj.FactorisedAdjoint(1e-5, solves=20)
-    monkeypatch.setattr(jax, "device_count", lambda: 2)
-    assert choose_for_fit(pencil, 20).name == "block-lanczos"
+    with programs_in(None):
+        assert [choose_for_fit(pencil, k).name for k in (20, 420)] == ["shift-invert", "dense"]
+        assert choose_for_fit(pencil, 20).adjoint == hj.FactorisedAdjoint(1e-5, solves=20)
+        monkeypatch.setattr(jax, "device_count", lambda: 2)
+        assert choose_for_fit(pencil, 20).name == "block-lanczos"
     assert choose_for_fit(hj.assemble(flat((12, 10), (1.0, 1.0))), 5).name == "dense"
