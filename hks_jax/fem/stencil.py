@@ -90,7 +90,8 @@ def _couplings(space: GridSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         where.append(o * own.size + both)
         rows.append(own.ravel()[both] - 1)
         cols.append(other.ravel()[both] - 1)
-    return np.concatenate(where), np.concatenate(rows), np.concatenate(cols)
+    short = np.int32 if 3**own.ndim * own.size <= np.iinfo(np.int32).max else np.int64
+    return np.concatenate(where).astype(short), np.concatenate(rows), np.concatenate(cols)
 
 
 class Stencil(eqx.Module):

@@ -38,10 +38,10 @@ def factorise_stably_on_host(matrix: csc_matrix) -> SuperLU:
 
 
 def inertia(K: csc_matrix, M: csc_matrix, shift: float) -> tuple[SuperLU | None, int, float]:
-    """Return a factorisation of K − σM, its number of negative pivots, and its error, measured by random solves.
+    """Return a factorisation of K − σM, its number of negative pivots, and the convergence rate of refinement with it.
 
-    The number is that of eigenvalues below σ if the error is less than `CONTRACTION`. If K − σM is singular or needs
-    pivoting, the error is infinite.
+    The number is that of eigenvalues below σ if the rate is less than `CONTRACTION`. If K − σM is singular or needs
+    pivoting, the rate is infinite.
     """
     matrix = (K - shift * M).tocsc()
     try:
@@ -55,8 +55,8 @@ def inertia(K: csc_matrix, M: csc_matrix, shift: float) -> tuple[SuperLU | None,
 
 def inertia_on_host(K: csc_matrix, M: csc_matrix, shift: float) -> tuple[int, bool]:
     """Return the number of eigenvalues below σ, by the inertia of K − σM, and whether a test confirms it."""
-    _, negative, error = inertia(K, M, shift)
-    return negative, error < CONTRACTION
+    _, negative, rate = inertia(K, M, shift)
+    return negative, rate < CONTRACTION
 
 
 def _contraction(matrix: csc_matrix, factor: SuperLU) -> float:

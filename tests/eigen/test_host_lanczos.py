@@ -87,3 +87,40 @@ def test_refined_pairs_are_as_accurate_as_the_others(monkeypatch):
     np.testing.assert_allclose(pairs.eigenvalues[1:], exact[1:], rtol=1e-11)
     assert (pairs.residuals < 1e-8).all()
     np.testing.assert_allclose(pairs.vectors @ pencil.mass.apply(pairs.vectors).T, np.eye(k), atol=1e-11)
+
+
+def path(weights):
+    """Return the graph Laplacian of a path."""
+    ends = np.append(weights, 0) + np.insert(weights, 0, 0)
+    return scipy.sparse.diags([ends, -weights, -weights], [0, 1, -1]).tolil()
+
+
+@pytest.mark.filterwarnings("ignore:k = 1 cuts a multiple eigenvalue")
+@pytest.mark.parametrize("coupling", [1e-9, 1e-11])
+def test_a_nearly_double_lowest_eigenvalue_far_from_zero(coupling):
+    """The spread of the computed eigenvalues is too small to be the distance of a shift."""
+    K = (scipy.sparse.kron(scipy.sparse.eye(2), path(np.ones(19))) + scipy.sparse.eye(40)).tolil()
+    K[19, 20] = K[20, 19] = -coupling
+    pairs = hj.eigsh(K.tocsr(), k=1, solver="shift-invert")
+    assert pairs.converged.all()
+    np.testing.assert_allclose(pairs.eigenvalues, 1, atol=1e-8)
+
+
+def test_most_of_the_diagonal_is_zero():
+    K = scipy.sparse.diags(np.r_[np.zeros(30), np.arange(1.0, 21)])
+    pairs = hj.eigenpairs(hj.sparse_pencil(K, null_vectors=np.eye(50)[:30]), 35, solver="shift-invert")
+    np.testing.assert_allclose(pairs.eigenvalues, np.r_[np.zeros(30), np.arange(1.0, 6)], atol=1e-12)
+
+
+def test_a_basis_that_is_too_small_grows_unless_the_user_set_it(rng):
+    """Eigenvalues over eight decades crowd at zero, relative to any shift."""
+    K = path(10.0 ** (-8 * rng.random(299))).tocsr()
+    pairs = hj.eigsh(K, k=10, solver="shift-invert")
+    np.testing.assert_allclose(pairs.eigenvalues, scipy.linalg.eigvalsh(K.toarray())[:10], atol=1e-15)
+    with pytest.warns(hj.AccuracyWarning, match=r"10 of 10 eigenpairs did not converge .* or a larger basis"):
+        hj.eigsh(K, k=10, solver=hj.ShiftInvert(basis=12))
+
+
+def test_numbers_that_overflow_find_nothing():
+    with pytest.warns(hj.AccuracyWarning, match="4 were not found"):
+        assert np.isnan(hj.eigsh(path(np.full(59, 1e-160)).tocsr(), k=4, solver="shift-invert").eigenvalues).all()

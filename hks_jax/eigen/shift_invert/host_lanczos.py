@@ -23,7 +23,7 @@ _NOTHING = 1e-13
 _SMALL = 1e-6
 """The norm, likewise relative, of directions that are orthogonalised again after normalisation."""
 _CROWDED = 3
-"""If the basis has a third of all dimensions, which few eigenvalues are left to fill, every step orthogonalises."""
+"""From a third of all dimensions on, every step orthogonalises, because new directions are small."""
 
 
 def nearest(
@@ -38,11 +38,11 @@ def nearest(
     room: int,
     seed: int,
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "n m"]]:
-    """Return the eigenvalues nearest to the shift, in no order, and M-orthonormal eigenvectors as columns.
+    """Return all eigenvalues within ``radius`` of the shift, and at least ``count``, with M-orthonormal eigenvectors.
 
-    They are at least ``count``, and all whose distance from the shift is up to ``radius``, except those of known
-    vectors, and copies of multiple eigenvalues; fewer if the basis would need more than ``room`` vectors, and none if
-    solutions are not finite. The number ``expected`` of basis vectors usually almost suffices.
+    The eigenvalues are in no order; eigenvectors are columns. Copies of multiple eigenvalues may be missing. If the
+    basis has ``room`` vectors, the result has those that converged and are nearer than all others. It is empty if
+    solutions are not finite. The first test for convergence is at ``expected`` basis vectors.
     """
     n, p = known.shape
     room, rng = min(room, n - p), np.random.default_rng(seed)
@@ -68,7 +68,7 @@ def nearest(
         diagonal = image.T @ onward
         diagonal = (diagonal + diagonal.T) / 2
         onward -= current @ diagonal
-        if not np.isfinite(diagonal).all():
+        if not np.isfinite(diagonal).all() or not diagonal.any():
             return np.empty(0), np.empty((n, 0))
         crowded = _CROWDED * (rows + width) > n
         if turn % 2 or crowded:  # every second step orthogonalises against the whole basis, two blocks at once
@@ -89,7 +89,9 @@ def nearest(
         if m >= expected or m == room:
             theta, modes = np.linalg.eigh(matrix[:m, :m])
             residuals, sizes = np.linalg.norm(coupling @ modes[m - width :], axis=0), np.abs(theta)
-            converged = (residuals <= np.maximum(_CONVERGED * sizes, _ROUNDING * sizes.max())) | (m == n - p)
+            converged = residuals <= np.maximum(_CONVERGED * sizes, _ROUNDING * sizes.max())
+            converged |= m == n - p  # the basis has all dimensions
+            # An unconverged value may hide another one, so only values nearer than all unconverged ones count.
             limit = sizes[~converged].max(initial=0)
             near = sizes > limit
             if m == room or (near.sum() >= count and radius * limit <= 1):

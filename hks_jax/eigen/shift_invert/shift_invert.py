@@ -22,6 +22,7 @@ from hks_jax.eigen.solver import Eigensolver, RawPairs, Report, Status, is_remot
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.pencil import Pencil
 from hks_jax.linear.host_matrices import factorise_on_host, host_matrices, inertia, inertia_on_host
+from hks_jax.linear.multifrontal import CONTRACTION
 from hks_jax.traced import is_traced
 
 HostPairs = tuple[np.ndarray, np.ndarray, float]
@@ -33,27 +34,29 @@ _BESIDE = 1e-6
 _TOLD = 25
 """The least number of solves between two reports."""
 _FEW = 12
-"""The largest number of eigenvalues for which a shift below the spectrum is as fast as one within."""
+"""The largest number of eigenvalues for which a shift below the spectrum is as fast as one within, so none is tried."""
 _TRIES = 3
 """The maximal number of shifts that are tried within the spectrum."""
 _POOR = 1e-9
 """The relative residual up to which eigenvectors need no further solve."""
 _ACCURATE = 1e-9
-"""The largest error of a factorisation within the spectrum."""
+"""The largest convergence rate of iterative refinement with a factorisation within the spectrum."""
 
 
 class ShiftInvert(Eigensolver[Pencil]):
     """Block Lanczos on (K − σM)⁻¹M with SuperLU's factorisation, in float64 on the host, without compilation.
 
-    The shift σ is about half of the k-th eigenvalue, or below the spectrum if no such shift is found. The inertia of a
-    second factorisation checks that no eigenvalue was missed. Under `jit` and `vmap`, the solver runs in a host
-    callback, one problem at a time. Outside `jit`, it can be interrupted, and reports progress.
+    For more than 12 pairs, the shift σ is about half of the k-th eigenvalue; otherwise, and if no such shift is found,
+    it is below the spectrum. The inertia of a second factorisation checks that no eigenvalue was missed. Under `jit`
+    and `vmap`, the solver runs in a host callback, one problem at a time. Outside `jit`, it can be interrupted, and
+    reports progress.
 
     Attributes:
         tolerance: the relative residual at which a pair counts as converged; Lanczos itself runs until 1e-12.
         max_restarts: the maximal number of searches after the first: for missing copies of multiple eigenvalues, and
             for further pairs if the basis is full.
-        basis: the maximal number of vectors in the Lanczos basis. None means 4k + 160, of which about 2k are used.
+        basis: the maximal number of vectors in the Lanczos basis. None means 4k + 160 at first, of which about 2k are
+            used, and twice as many in each search after one that found too few pairs.
 
     Examples:
         >>> sparse = hj.eigenpairs(field, k=12, solver=hj.ShiftInvert(basis=30))
@@ -94,10 +97,11 @@ class ShiftInvert(Eigensolver[Pencil]):
             with threadpool_limits(1, user_api="blas"):
                 values, vectors, bound = self._searched(K, M, k, scales, report)
                 if not null_space_known and is_remote(values, _rounding(K, M)):
-                    spread = values[-1] - values[0]
-                    nearer = values[0] - spread
+                    # The distance from the spectrum is its spread, but large enough for an accurate factorisation.
+                    distance = max(values[-1] - values[0], _BESIDE * values[0])
+                    nearer = values[0] - distance
                     origin, K = origin + nearer, K - nearer * M
-                    scales = scales._replace(below=spread, within=1.5 * spread)
+                    scales = scales._replace(below=distance, within=1.5 * distance)
                     values, vectors, bound = self._searched(K, M, k, scales, report)
             return tuple(np.asarray(result, dtype) for result in (values + origin, vectors, bound + origin))
 
@@ -133,33 +137,40 @@ class ShiftInvert(Eigensolver[Pencil]):
             solves += x.shape[1]
             return factor.solve(x)
 
+        room = self.basis or 4 * k + 40 * block
         for seed in range(self.max_restarts + 1):
             expected = int(usual * missing / k) + 2 * block
-            room = self.basis or 4 * k + 40 * block
             # Between 0 and the shift, all eigenvalues are wanted; in later searches, all up to the k-th one.
             count, radius = k - values.size, max(shift, values[-1] - shift if values.size == k else 0.0)
-            further, others = nearest(inverse, mass, shift, vectors, count, radius, block, expected, room, seed)
+            try:
+                with np.errstate(all="ignore"):
+                    further, others = nearest(inverse, mass, shift, vectors, count, radius, block, expected, room, seed)
+            except np.linalg.LinAlgError:  # overflow
+                return nothing
+            if not further.size and (self.basis or room >= n - values.size):
+                return nothing
             order = np.argsort(np.concatenate([values, further]))[:k]
             values = np.concatenate([values, further])[order]
             vectors = np.concatenate([vectors, others], axis=1)[:, order]
             if values.size < k:
-                missing = k - values.size
+                # Many more eigenvalues than usual are near the shift.
+                missing, room = k - values.size, self.basis or 2 * room
                 continue
             # Lanczos can miss copies of a multiple eigenvalue. By Sylvester's law of inertia, the negative pivots of
             # K − σM count the eigenvalues below σ. If pairs are missing, search orthogonally to known pairs.
-            # The count is just below the last value. If all values are copies of the lowest eigenvalue, the distance is
-            # just above their rounding errors; if the factorisation is too inaccurate there, the distance is larger.
-            near = max(_BESIDE * (values[-1] - values[0]), 4 * rounding)
-            for distance in (near, _BESIDE * max(values[-1], scales.below)):
+            # The count is just below the last value, beyond its rounding errors; if the factorisation is too inaccurate
+            # there, further below.
+            margin = max(_BESIDE * (values[-1] - values[0]), 4 * rounding)
+            for distance in (margin, max(30 * margin, _BESIDE * max(values[-1], scales.below))):
                 below = values[-1] - distance
                 if below <= 0:  # only null vectors
-                    return _ordered(values, vectors, max(below, 0.0))
+                    return _ordered(values, vectors, 0.0)
                 negative, sound = inertia_on_host(K, M, below)
                 if sound:
                     break
             missing = negative - int((values < below).sum())
             if not sound or missing <= 0:
-                return _ordered(*_refined(K, M, scales.below, vectors), below if sound else np.nan)
+                return _ordered(*_refined(K, M, scales.below, vectors), below if sound and missing == 0 else np.nan)
             report(f"{missing} eigenpairs are missing: searching again")
         return nothing
 
@@ -167,7 +178,7 @@ class ShiftInvert(Eigensolver[Pencil]):
 class _Scales(NamedTuple):
     """Estimates from which shifts are chosen."""
 
-    below: float  # a positive number that is small relative to the k-th eigenvalue
+    below: float  # the distance of a shift below the spectrum, relative to which the lowest eigenvalues are not small
     within: float  # half of the k-th eigenvalue
     dimension: int  # the dimension d in Weyl's law, by which the j-th eigenvalue grows like j^(2/d)
 
@@ -176,7 +187,8 @@ def _scales(K: csc_matrix, M: csc_matrix, k: int, dimension: int | None, volume:
     if dimension is not None and np.isfinite(volume):
         return _Scales(0.1 * (2 * np.pi) ** 2 / volume ** (2 / dimension), weyl(k, volume, dimension) / 2, dimension)
     # On a uniform grid in 2D, the k-th of n eigenvalues is about 2k/n times the median.
-    median = float(np.median(K.diagonal() / M.diagonal()))
+    quotients = np.abs(K.diagonal() / M.diagonal())
+    median = float(np.median(quotients[quotients > 0])) if (quotients > 0).any() else 1.0
     return _Scales(1e-3 * median, median * k / K.shape[0], 2)
 
 
@@ -186,16 +198,18 @@ def _shifted(K: csc_matrix, M: csc_matrix, k: int, scales: _Scales) -> tuple[flo
     """Return a shift σ near half of the k-th eigenvalue or, if there is no accurate one, below the spectrum."""
     shift, wanted = scales.within, k / 2 ** (scales.dimension / 2)
     for _ in range(_TRIES if k > _FEW and shift > 0 else 0):
-        factor, number, error = inertia(K, M, shift)
-        if factor is not None and error < _ACCURATE and k / 8 <= number <= 3 * k / 4:
+        factor, number, rate = inertia(K, M, shift)
+        if factor is not None and rate < _ACCURATE and k / 8 <= number <= 3 * k / 4:
             return shift, factor
-        shift *= np.clip((wanted / max(number, 0.5)) ** (2 / scales.dimension), 1 / 16, 16) * 1.01
+        if rate < CONTRACTION:
+            shift *= np.clip((wanted / max(number, 0.5)) ** (2 / scales.dimension), 1 / 16, 16)
+        shift *= 1.01  # beside an eigenvalue
     return -scales.below, factorise_on_host(K + scales.below * M)
 
 
-# If an eigenvalue is near the shift σ, a step of Lanczos amplifies the component along its eigenvector much more than
-# others, and so are rounding errors relative to the others. They have high frequencies, so that residuals may be large
-# relative to low eigenvalues. A solve with K + sM divides an error along φₗ by (λₗ + s)/(λᵢ + s). Rayleigh quotients
+# If an eigenvalue is near the shift σ, solutions consist mostly of its eigenvector, and their rounding errors are large
+# relative to the other components. These errors have high frequencies, so that residuals may be large relative to low
+# eigenvalues. A solve with K + sM divides an error along φₗ by (λₗ + s)/(λᵢ + s). Rayleigh quotients
 # are accurate in any case, because errors of eigenvectors enter them squared.
 def _refined(K: csc_matrix, M: csc_matrix, s: float, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return eigenvalues, and the M-orthonormal eigenvectors after a further solve for those with large residuals."""
