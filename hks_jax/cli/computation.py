@@ -16,7 +16,7 @@ from hks_jax.cli.options import add_metric, add_signature, add_solving, defaults
 from hks_jax.cli.parsing import Times, parse_times
 from hks_jax.cli.progress import Progress
 from hks_jax.domain.tensor_checks import Interpolation, MetricChoice, OperatorChoice
-from hks_jax.eigen.automatic import choose_solvers
+from hks_jax.eigen.automatic import choose_for_command, choose_solvers
 from hks_jax.eigen.weyl import weyl
 from hks_jax.fem.boundary import BoundarySpec, default_boundary, unreached_sides
 from hks_jax.io import TensorVolume
@@ -235,14 +235,16 @@ def domain_of_volume(volume: TensorVolume, settings: Settings, image: str = "") 
 def solver_of(
     settings: Settings, pencil: hj.Pencil | hj.MirrorPencil, k: int, keep_spare: bool = False
 ) -> str | hj.Eigensolver:
-    """Return the solver: its name, because the two problems of "mean" may get different solvers, or a Chebyshev filter.
+    """Return the solver, or its name, because the two problems of "mean" may get different solvers by name.
 
-    The filter has the tolerance of the command line. With ``keep_spare`` it keeps what later computations start from.
+    A Chebyshev filter has the tolerance of the command line. With ``keep_spare`` it keeps what later computations start
+    from.
     """
-    solver = choose_solvers(settings.solver, pencil, k)[0][0]
+    automatic = settings.solver == "auto"
+    solver = choose_for_command(pencil, k) if automatic else choose_solvers(settings.solver, pencil, k)[0][0]
     if isinstance(solver, hj.ChebyshevFilter):
         return replace(solver, tolerance=_TOLERANCE, keep_spare=keep_spare)
-    return settings.solver
+    return solver if isinstance(solver, hj.ShiftInvert) else settings.solver
 
 
 def compute_pairs(

@@ -22,15 +22,15 @@ _SMALL = 1500
 """The largest number n of unknowns for which the dense solver, which takes O(n³) time, is chosen."""
 
 # The choice is between shift-invert and a solver in JAX, called ``ours``: the Chebyshev filter on grids in 3D or in
-# float32, otherwise block Lanczos. A solver in JAX takes many seconds to compile at any size. So up to a certain n·k,
-# shift-invert is the fastest in the first call, and the other solver in later calls. For each solver,
-# benchmarks/first_answer/automatic.py divides the time of its first call by the shortest first call of all solvers, and
-# likewise for later calls. The choice minimises the larger of the two ratios.
-_LARGE = {2: 8_000_000, 3: 800_000}
-"""The least n·k (unknowns times pairs) for which a solver in JAX is chosen, for each dimension; 2 stands for None."""
-
-_DIFFERENTIATED_IN_JAX = 800_000
-"""The least n·k for which derivatives of eigenpairs from shift-invert are compiled outside `jit`."""
+# float32, otherwise block Lanczos. A solver in JAX takes many seconds to compile at any size, and uses all cores, while
+# shift-invert uses one. So for n·k (unknowns times pairs) up to 5 million, shift-invert has the shortest first call and
+# the other solver, on free cores, the shortest later calls: see benchmarks/first_answer/automatic.py.
+_LARGE = 800_000
+"""The least n·k from which on later calls of shift-invert take much longer than those of ``ours``."""
+_LARGE_UNDER_JIT = 2_000_000
+"""The least n·k, except in 3D, for which ``ours`` is chosen under `jit`, where it takes twice as long to compile."""
+_LARGE_FOR_COMMAND = 5_000_000
+"""The least n·k, except in 3D, for which ``ours`` takes the least processor time in a process with few domains."""
 
 
 def choose_solver(solver: str | Eigensolver, pencil: Pencil, k: int) -> Eigensolver:
@@ -68,6 +68,15 @@ def choose_solvers(solver: str | Eigensolver, pencil: AnyPencil, k: int) -> list
     return solvers
 
 
+def choose_for_command(pencil: AnyPencil, k: int) -> Eigensolver:
+    """Return the solver that ``"auto"`` chooses in a command, whose processor time counts, compilation included."""
+    part, share = pencil.parts[0], -(-k // len(pencil.parts))
+    usual = choose_solver("auto", part, share)
+    planar = part.space.dimension != 3 and part.stiffness.dtype == np.float64 and jax.default_backend() == "cpu"
+    few = planar and part.space.n_dof * share < _LARGE_FOR_COMMAND
+    return ShiftInvert() if few and isinstance(usual, BlockLanczos) else usual
+
+
 def choose_for_fit(pencil: AnyPencil, k: int) -> Eigensolver:
     """Return the solver that ``"auto"`` chooses in a fit, where values are traced.
 
@@ -77,16 +86,18 @@ def choose_for_fit(pencil: AnyPencil, k: int) -> Eigensolver:
     n, adjoint = pencil.space.n_dof, FactorisedAdjoint(1e-5, solves=20)
     if n <= _SMALL or k + 20 > BlockLanczos().max_pairs(n):
         return Dense()
-    return (ShiftInvert if _calls_host(n, k, pencil.space.dimension) else BlockLanczos)(adjoint=adjoint)
+    return (ShiftInvert if _calls_host(pencil.parts[0], k) else BlockLanczos)(adjoint=adjoint)
 
 
-def _calls_host(n: int, k: int, dimension: int | None) -> bool:
+def _calls_host(pencil: Pencil, k: int) -> bool:
     """Return whether a program under `jax.jit` calls the host for eigenpairs.
 
-    With several devices, XLA might call the host on each of them. JAX cannot store such a program in a cache.
+    With several devices, XLA might call the host on each of them. JAX cannot store such a program in a cache. Without a
+    lower bound of the spectrum, the host may leave doubt, and under `jit` a second solver cannot follow.
     """
+    small = pencil.space.n_dof * k < (_LARGE if pencil.space.dimension == 3 else _LARGE_UNDER_JIT)
     alone = jax.default_backend() == "cpu" and jax.device_count() == 1
-    return n * k < _LARGE[dimension or 2] and alone and not jax.config.values["jax_compilation_cache_dir"]
+    return small and pencil.bounded and alone and not jax.config.values["jax_compilation_cache_dir"]
 
 
 def _in_jax(pencil: Pencil, k: int) -> Eigensolver:
@@ -100,13 +111,19 @@ def _in_jax(pencil: Pencil, k: int) -> Eigensolver:
 
 
 def _automatic(pencil: Pencil, k: int) -> Eigensolver:
-    n, dimension = pencil.space.n_dof, pencil.space.dimension
+    n, planar = pencil.space.n_dof, pencil.space.dimension != 3
     if n <= max(_SMALL, 4 * k - 1):
         return Dense()
-    known = is_concrete_on_cpu(jax.lax.stop_gradient((pencil.stiffness, pencil.mass)))
-    # Under `jit`, a second solver cannot follow if shift-invert leaves doubt, as it may without a lower bound.
-    if not (n * k < _LARGE[dimension or 2] if known else _calls_host(n, k, dimension) and pencil.bounded):
-        return _in_jax(pencil, k)
-    # Derivatives in JAX take half of the time, except in 3D and in float32, but several seconds of compilation.
-    in_jax = (not known or n * k >= _DIFFERENTIATED_IN_JAX) and pencil.stiffness.dtype == np.float64 and dimension != 3
-    return ShiftInvert(adjoint=FactorisedAdjoint()) if in_jax else ShiftInvert()
+    exact, laplacian = pencil.stiffness.dtype == np.float64, pencil.measured and pencil.bounded
+    ours = _in_jax(pencil, k)
+    if not is_concrete_on_cpu(jax.lax.stop_gradient((pencil.stiffness, pencil.mass))):
+        if not _calls_host(pencil, k):
+            return ours
+        # In later calls, derivatives in JAX are twice as fast as on the host; in 3D and in float32, they are not.
+        return ShiftInvert(adjoint=FactorisedAdjoint()) if exact and planar else ShiftInvert()
+    if not laplacian:
+        return ShiftInvert() if n * k < _LARGE else ours
+    # In float32, block Lanczos factorises in float32; so it searches repeatedly, and leaves some pairs unconverged.
+    suited = BlockLanczos if planar and exact else ChebyshevFilter
+    large = _LARGE if exact or not planar else _LARGE_FOR_COMMAND
+    return ours if isinstance(ours, suited) and n * k >= large else ShiftInvert()

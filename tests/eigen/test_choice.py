@@ -11,7 +11,7 @@ from fields import flat, random_spd
 
 import hks_jax as hj
 from hks_jax.eigen import automatic
-from hks_jax.eigen.automatic import choose_for_fit, choose_solver
+from hks_jax.eigen.automatic import choose_for_command, choose_for_fit, choose_solver
 from hks_jax.eigen.shift_invert.shift_invert import ShiftInvert
 
 
@@ -142,28 +142,38 @@ def test_programs_that_jax_stores_do_not_call_the_host(tmp_path):
 @pytest.mark.slow
 def test_what_auto_chooses_where_values_are_known():
     plane, volume = hj.assemble(flat((42, 41), (1.0, 1.0))), hj.assemble(flat((12, 12, 13), (1.0, 1.0, 1.0)))
-    surface = hj.assemble(hj.examples.bumpy_torus_mesh(130))
+    surface = hj.assemble(hj.examples.bumpy_torus_mesh(50))
     assert choose_solver("auto", plane, 20).name == "shift-invert"
     assert choose_solver("auto", plane, 431).name == "dense"
     assert [choose_solver("auto", volume, k).name for k in (20, 190)] == ["shift-invert"] * 2
     assert choose_solver("auto", hj.assemble(flat((20, 20, 20), (1.0, 1.0, 1.0))), 100).name == "chebyshev-filter"
-    assert [choose_solver("auto", surface, k).name for k in (470, 480)] == ["shift-invert", "block-lanczos"]
+    assert [choose_solver("auto", surface, k).name for k in (300, 450)] == ["shift-invert", "block-lanczos"]
     large = hj.assemble(flat((130, 130), (1.0, 1.0)))
-    assert [choose_solver("auto", large, k).name for k in (470, 480)] == ["shift-invert", "block-lanczos"]
+    assert [choose_solver("auto", large, k).name for k in (40, 50)] == ["shift-invert", "block-lanczos"]
 
 
 @pytest.mark.slow
 def test_what_auto_chooses_in_single_precision():
     plane, volume = (single(hj.assemble(flat(shape, (1.0,) * len(shape)))) for shape in ((130, 130), (20, 20, 20)))
-    assert [choose_solver("auto", plane, k).name for k in (470, 480)] == ["shift-invert", "chebyshev-filter"]
+    assert [choose_solver("auto", plane, k).name for k in (290, 300)] == ["shift-invert", "chebyshev-filter"]
     assert choose_solver("auto", volume, 100).name == "chebyshev-filter"
 
 
 def test_the_problems_of_a_doubled_domain_share_the_pairs(monkeypatch):
     field = hj.TensorField(hj.Grid((42, 41)), np.broadcast_to(np.diag([1.0, 2.0]), (42, 41, 2, 2)))
-    monkeypatch.setattr(automatic, "_LARGE", {2: 30 * field.grid.size})
+    monkeypatch.setattr(automatic, "_LARGE", 30 * field.grid.size)
     assert hj.eigenpairs(field, 40, "mean").solver_name == "shift-invert"
     assert choose_solver("auto", hj.assemble(field), 40).name == "block-lanczos"
+
+
+def test_a_command_takes_shift_invert_for_more_pairs(monkeypatch):
+    pencil = hj.assemble(hj.TensorField(hj.Grid((42, 41)), np.broadcast_to(np.diag([1.0, 2.0]), (42, 41, 2, 2))))
+    monkeypatch.setattr(automatic, "_LARGE", 30 * pencil.space.n_dof)
+    monkeypatch.setattr(automatic, "_LARGE_FOR_COMMAND", 60 * pencil.space.n_dof)
+    assert [choose_solver("auto", pencil, k).name for k in (20, 40, 80)] == ["shift-invert", *["block-lanczos"] * 2]
+    assert [choose_for_command(pencil, k).name for k in (20, 40, 80)] == [*["shift-invert"] * 2, "block-lanczos"]
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert choose_for_command(pencil, 40).name == "block-lanczos"
 
 
 @pytest.mark.parametrize("boundary", ["neumann", "mean"])
