@@ -42,8 +42,8 @@ class RESULTS(eqx.Enumeration):
         "slightly different k."
     )
     uncertain = (
-        "Rounding of the matrices to float32 may change some eigenvalues by more than 1 % (see `.rounding`). Use "
-        "float64, or state the null vectors."
+        "Rounding of the matrices may change some eigenvalues by more than 1 % (see `.rounding`). Use float64, or "
+        "state the null vectors."
     )
 
 
@@ -260,9 +260,11 @@ class Eigenpairs(ABC):
             most, of = float(np.asarray(self.rounding)[uncertain].max()), int(uncertain.sum())
             own = isinstance(self.space, MatrixSpace) and not self.null_space_known
             stated = ", or give `sparse_pencil` the null vectors" if own else ""
+            single = values.dtype == np.float32
+            remedy = "Use float64" if single else "Eliminate unknowns instead of fixing them by large entries"
             sentences.append(
                 f"{of} of {values.size} eigenvalues (λ = {some}{', …' * (of > 3)}) are uncertain: rounding of the "
-                f"matrices to float32 changes them by up to {most:.1e}. Use float64{stated}"
+                f"matrices to {values.dtype} changes them by up to {most:.1e}. {remedy}{stated}"
             )
         stretch = _anisotropy(self._pencils) if values.dtype == np.float32 else 1.0
         if (rounding := np.finfo(np.float32).eps * stretch) > _ROUNDED:

@@ -120,19 +120,28 @@ def _near_zero(
 ) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
     """Return the eigenvalues that are zero within rounding, with 0 for the others, and `Eigenpairs.rounding`.
 
-    In float32, eigenvalues that are zero within rounding may be accurate in float64, in which the host computes.
+    In float32, eigenvalues that are zero within rounding may be accurate in float64, in which the host computes. In
+    float64, they may be accurate if their eigenvectors are small where entries of K are large.
     ``accurate`` states whether the solver computed in float64.
     """
     nothing, null_space_known = jax_array(np.zeros(values.shape, values.dtype)), pencil.null_space is not None
+    small, rounding = np.zeros((2, values.size), values.dtype)
     if values.dtype != np.float32:
-        return nothing, nothing
+        if null_space_known or not is_concrete_on_cpu((pencil, vectors, zero)) or not np.any(zero):
+            return nothing, nothing
+        where = np.flatnonzero(zero)
+        quotients, changes, residuals = near_zero(pencil, np.asarray(vectors)[where], True)
+        # Rounding of the vectors changes quotients by its square.
+        sure = np.abs(quotients) > np.maximum(changes, (100 * np.finfo(float).eps) ** 2 * float(largest(pencil)))
+        small[where], rounding[where] = np.where(sure, quotients, 0), np.where(sure, np.maximum(changes, residuals), 0)
+        small[where] = np.maximum.accumulate(small[where])
+        return jax.device_put((small, rounding))
     if not single_on_host:
         return nothing, nothing if null_space_known else jnp.where(zero, indistinct(pencil, values.dtype), 0)
-    small, rounding = np.zeros((2, values.size), np.float32)
     near = np.abs(np.asarray(values)) <= float(indistinct(pencil, values.dtype)) / UNCERTAIN
     where = np.flatnonzero(near & (np.arange(values.size) >= pencil.n_null))
     if where.size:
-        quotients, changes = near_zero(pencil, np.asarray(vectors)[where], accurate)
+        quotients, changes, _ = near_zero(pencil, np.asarray(vectors)[where], accurate)
         # Rounding of the vectors to float32 changes quotients by its square.
         exact = np.abs(quotients) <= np.finfo(np.float32).eps ** 2 * float(largest(pencil))
         small[where], rounding[where] = np.where(exact, 0, quotients), np.where(exact, 0, changes)

@@ -111,8 +111,8 @@ def balanced(pencil: SymmetricPencil) -> Float[Array, "1 n_dof"]:
 
 def near_zero(
     pencil: SymmetricPencil, vectors: Float[np.ndarray, "m n_dof"], accurate: bool
-) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Return float64 Rayleigh quotients of K, not of K − σM, and their changes by rounding of the entries of K.
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """Return float64 Rayleigh quotients of K, not of K − σM, their changes by rounding of K's entries, and residuals.
 
     Unless the vectors are ``accurate``, the changes include the effect of rounding on the null vectors of K.
     """
@@ -128,9 +128,12 @@ def near_zero(
     limits = sizes @ np.ones(pencil.size)
     exact = np.abs(sums) <= _EXACT * limits if accurate else np.zeros(pencil.size, bool)
     changes = np.where(exact, limits, 2 * limits) @ columns**2 - np.sum(columns * (sizes @ columns), axis=0)
-    squares = np.sum(columns * (M @ columns), axis=0)
+    force, image = K @ columns, M @ columns
+    squares = np.sum(columns * image, axis=0)
     rounding = np.finfo(source.stiffness.dtype).eps * changes / squares
-    return np.sum(columns * (K @ columns), axis=0) / squares, rounding
+    quotients = np.sum(columns * force, axis=0) / squares
+    residuals = np.linalg.norm(force - quotients * image, axis=0) / np.linalg.norm(image, axis=0)
+    return quotients, rounding, residuals
 
 
 # The assembly computes the entries (i, j) and (j, i) separately, so their rounding errors differ. `host_matrices`

@@ -436,3 +436,25 @@ def test_in_float32_none_is_missing_though_as_many_are_found():
     pairs = hj.eigsh(K, M, 41, solver=hj.BlockLanczos())
     np.testing.assert_allclose(pairs.eigenvalues, exact, atol=1e-5)
     np.testing.assert_allclose(pairs.vectors @ (M @ np.asarray(pairs.vectors).T), np.eye(41), atol=1e-4)
+
+
+@pytest.mark.filterwarnings("ignore:.*are uncertain. rounding of the matrices to float64")
+@pytest.mark.filterwarnings("ignore:k = 4 cuts a multiple eigenvalue")
+@pytest.mark.parametrize(("solver", "rtol"), [("shift-invert", 1e-6), ("dense", 1e-3)])
+def test_small_eigenvalues_beside_a_large_entry_are_not_zero(solver, rtol):
+    """A penalty fixes a node. Eigenvalues below 4ε times the penalty are accurate, because eigenvectors are 0 there."""
+    K = sp.diags([np.full(59, -1.0), np.full(60, 2.0), np.full(59, -1.0)], [-1, 0, 1]).tolil()
+    K[59, 59] = 1.0
+    fixed = scipy.linalg.eigvalsh(K.toarray()[1:, 1:])[:4]
+    K[0, 0] += 1e12
+    pairs = hj.eigsh(K.tocsr(), k=4, solver=solver)
+    np.testing.assert_allclose(pairs.eigenvalues, fixed, rtol=rtol)
+    uncertain = np.asarray(pairs.uncertain)
+    assert ((np.abs(pairs.eigenvalues - fixed) < 0.01 * fixed) | uncertain).all()
+
+
+def test_the_zero_of_a_graph_laplacian_stays_zero():
+    K = sp.diags([np.full(59, -1.0), np.r_[1, np.full(58, 2.0), 1], np.full(59, -1.0)], [-1, 0, 1])
+    pairs = hj.eigsh(K.tocsr(), k=3)
+    assert pairs.eigenvalues[0] == 0
+    assert not pairs.uncertain.any()
