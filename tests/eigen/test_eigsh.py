@@ -440,7 +440,7 @@ def test_in_float32_none_is_missing_though_as_many_are_found():
 
 @pytest.mark.filterwarnings("ignore:.*are uncertain. rounding of the matrices to float64")
 @pytest.mark.filterwarnings("ignore:k = 4 cuts a multiple eigenvalue")
-@pytest.mark.parametrize(("solver", "rtol"), [("shift-invert", 1e-6), ("dense", 1e-3)])
+@pytest.mark.parametrize(("solver", "rtol"), [("shift-invert", 1e-6), ("dense", 1e-2)])
 def test_small_eigenvalues_beside_a_large_entry_are_not_zero(solver, rtol):
     """A penalty fixes a node. Eigenvalues below 4ε times the penalty are accurate, because eigenvectors are 0 there."""
     K = sp.diags([np.full(59, -1.0), np.full(60, 2.0), np.full(59, -1.0)], [-1, 0, 1]).tolil()
