@@ -59,7 +59,7 @@ class ShiftInvert(Eigensolver[Pencil]):
             used, and twice as many in each search after one that found too few pairs.
 
     Examples:
-        >>> sparse = hj.eigenpairs(field, k=12, solver=hj.ShiftInvert(basis=30))
+        >>> sparse = hj.eigenpairs(field, k=12, solver=hj.ShiftInvert(basis=60))
         >>> np.allclose(sparse.eigenvalues, pairs.eigenvalues, atol=1e-3)
         True
     """
