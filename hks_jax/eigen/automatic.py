@@ -115,9 +115,9 @@ def _automatic(pencil: Pencil, k: int) -> Eigensolver:
     if n <= max(_SMALL, 4 * k - 1):
         return Dense()
     exact, laplacian = pencil.stiffness.dtype == np.float64, pencil.measured and pencil.bounded
-    ours = _in_jax(pencil, k)
+    ours, by_callback = _in_jax(pencil, k), _calls_host(pencil, k)
     if not is_concrete_on_cpu(jax.lax.stop_gradient((pencil.stiffness, pencil.mass))):
-        if not _calls_host(pencil, k):
+        if not by_callback:
             return ours
         # In later calls, derivatives in JAX are twice as fast as on the host; in 3D and in float32, they are not.
         return ShiftInvert(adjoint=FactorisedAdjoint()) if exact and planar else ShiftInvert()

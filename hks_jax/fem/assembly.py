@@ -1,6 +1,6 @@
 """Assembly of the matrix pencil of an operator on a tensor field or a mesh, with checks of all arguments."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Literal, get_args
 
@@ -15,7 +15,7 @@ from hks_jax.fem.elements import Quadrature
 from hks_jax.fem.fields import checked_field
 from hks_jax.fem.forms import Form, WeakForm, l2, laplace_beltrami
 from hks_jax.fem.integrals import assemble_grid, assemble_mesh, grid_points, mesh_nodes, mesh_points
-from hks_jax.fem.pencil import AnyPencil, MirrorPencil
+from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
 from hks_jax.fem.problems import problems_of
 from hks_jax.linear.operators import PatternedOperator, require_symmetric
 from hks_jax.traced import is_traced
@@ -168,6 +168,12 @@ def assemble_forms(
     return _assembled(domain, boundary, operator, dict(fields or {}), degree, midpoints)
 
 
+def _on_each(
+    pencil_on: Callable[..., Pencil], fields: dict[str, Any], spaces: Sequence[Any], operator: WeakForm
+) -> list[Pencil]:
+    return [pencil_on(fields, space, operator) for space in spaces]
+
+
 def _assembled(
     domain: TensorField | SimplicialMesh,
     boundary: BoundarySpec,
@@ -192,6 +198,7 @@ def _assembled(
             for name, value in given.items()
         }
         pencil_on = partial(assemble_mesh, domain, nodes, midpoints is not None)
+        pencils_on: Callable[..., list[Pencil]] = partial(_on_each, pencil_on)
     else:
         if not isinstance(domain, TensorField):
             raise TypeError(f"domain: got {type(domain).__name__}; expected a TensorField, a SurfaceMesh or a TetMesh")
@@ -203,17 +210,14 @@ def _assembled(
         if operator.components > 1 and "mirror" in str(boundary):
             raise ValueError('boundary: got "mirror" with components; only scalar functions support "mirror"')
         nodes, dtype = None, domain.tensors.dtype
-        points = partial(grid_points, domain.grid, dtype=dtype)
-    spaces: Any = problems_of(domain, boundary, degree)
+        points, pencils_on = partial(grid_points, domain.grid, dtype=dtype), partial(assemble_grid, domain)
+    spaces = problems_of(domain, boundary, degree)
     built_in, held = not operator.custom, {}
     for name, value in given.items():
         settings = {"scalar": built_in, "positive": built_in and name == "density"}
         held[name] = checked_field(name, value, spaces[0], partial(points, spaces[0]), dtype, **settings)
     operator = operator._replace(checked=built_in or not is_traced((domain, held, nodes)))
-    if isinstance(domain, TensorField):
-        pencils = assemble_grid(domain, held, spaces, operator)
-    else:
-        pencils = [pencil_on(held, each, operator) for each in spaces]
+    pencils = pencils_on(held, spaces, operator)
     if midpoints is not None and not is_traced(pencils) and np.isnan(pencils[0].mass.diagonal()).any():
         raise ValueError("midpoints: got positions that fold or invert cells; move them closer to the straight edges")
     if operator.custom and operator.checked:

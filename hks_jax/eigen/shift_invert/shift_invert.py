@@ -100,9 +100,10 @@ class ShiftInvert(Eigensolver[Pencil]):
                     # The distance from the spectrum is its spread, but large enough for an accurate factorisation.
                     distance = max(values[-1] - values[0], _BESIDE * values[0])
                     nearer = values[0] - distance
-                    origin, K = origin + nearer, K - nearer * M
                     scales = scales._replace(below=distance, within=1.5 * distance)
-                    values, vectors, bound = self._searched(K, M, k, scales, report)
+                    again = self._searched(K - nearer * M, M, k, scales, report)
+                    if np.isfinite(again[2]):
+                        (values, vectors, bound), origin = again, origin + nearer
             return tuple(np.asarray(result, dtype) for result in (values + origin, vectors, bound + origin))
 
         inputs = (lowest, jnp.inf if pencil.volume is None else pencil.volume, *data)
@@ -209,8 +210,8 @@ def _shifted(K: csc_matrix, M: csc_matrix, k: int, scales: _Scales) -> tuple[flo
 
 # If an eigenvalue is near the shift σ, solutions consist mostly of its eigenvector, and their rounding errors are large
 # relative to the other components. These errors have high frequencies, so that residuals may be large relative to low
-# eigenvalues. A solve with K + sM divides an error along φₗ by (λₗ + s)/(λᵢ + s). Rayleigh quotients
-# are accurate in any case, because errors of eigenvectors enter them squared.
+# eigenvalues. A solve with K + sM divides an error along φₗ by (λₗ + s)/(λᵢ + s). Rayleigh quotients are accurate in
+# any case, because errors of eigenvectors enter them squared.
 def _refined(K: csc_matrix, M: csc_matrix, s: float, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return eigenvalues, and the M-orthonormal eigenvectors after a further solve for those with large residuals."""
     force, image = K @ vectors, M @ vectors
