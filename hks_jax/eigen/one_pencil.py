@@ -20,6 +20,9 @@ from hks_jax.fem.space import MatrixSpace
 from hks_jax.linear.host_matrices import balanced, near_zero
 from hks_jax.linear.symmetric_pencil import SymmetricPencil, tabulated
 
+_REPEATED = 100
+"""The largest effect of repeated rounding in sums over all nodes, in units of the effect of rounding once."""
+
 
 def pairs_of_pencil(
     pencil: Pencil,
@@ -130,9 +133,10 @@ def _near_zero(
         if null_space_known or not is_concrete_on_cpu((pencil, vectors, zero)) or not np.any(zero):
             return nothing, nothing
         where = np.flatnonzero(zero)
-        quotients, changes, residuals = near_zero(pencil, np.asarray(vectors)[where], True)
-        # Rounding of the vectors changes quotients by its square.
-        sure = np.abs(quotients) > np.maximum(changes, (100 * np.finfo(float).eps) ** 2 * float(largest(pencil)))
+        quotients, changes, residuals = near_zero(pencil, np.asarray(vectors)[where], False)
+        # Rounding of the vectors changes quotients by its square. Sums over many nodes round repeatedly.
+        least = (_REPEATED * np.finfo(float).eps) ** 2 * float(largest(pencil))
+        sure = np.abs(quotients) > np.maximum(_REPEATED * changes, least)
         small[where], rounding[where] = np.where(sure, quotients, 0), np.where(sure, np.maximum(changes, residuals), 0)
         small[where] = np.maximum.accumulate(small[where])
         return jax.device_put((small, rounding))
