@@ -23,7 +23,7 @@ from versions import parsed
 import hks_jax as hj
 from hks_jax.eigen.automatic import choose_solver
 
-CASES = ["64²/50", "64²/200", "128²/100", "256²/100", "16³/50", "24³/100", "mesh4096/50", "mesh16384/100"]
+CASES = ["64²/50", "64²/200", "128²/100", "128²/200", "256²/100", "16³/50", "24³/100", "mesh4096/50", "mesh16384/100"]
 PRECISIONS = ["float64", "float32"]
 
 
