@@ -1,4 +1,4 @@
-"""What "auto" chooses, and what it chooses under jit: on one CPU a solver on the host, elsewhere none."""
+"""The automatic choice of a solver. Under jit, it is a solver on the host only on a single CPU."""
 
 from contextlib import contextmanager
 from functools import partial

@@ -46,7 +46,7 @@ def nearest(
     """
     n, p = known.shape
     room, rng = min(room, n - p), np.random.default_rng(seed)
-    # The first p rows are the known vectors; the other rows are the basis V, of which m rows are filled.
+    # The known vectors are the first p rows. The basis V follows, and has m vectors so far.
     basis, matrix = np.empty((p + room, n)), np.zeros((room, room))  # matrix: VᵀMAV
     basis[:p] = known.T
     m, turn, largest = 0, 0, 0.0

@@ -55,8 +55,8 @@ class ShiftInvert(Eigensolver[Pencil]):
         tolerance: the relative residual at which a pair counts as converged; Lanczos itself runs until 1e-12.
         max_restarts: the maximal number of searches after the first: for missing copies of multiple eigenvalues, and
             for further pairs if the basis is full.
-        basis: the maximal number of vectors in the Lanczos basis. None means 4k + 160 at first, of which about 2k are
-            used, and twice as many in each search after one that found too few pairs.
+        basis: the maximal number of vectors in the Lanczos basis. If None, it is 4k + 160, and doubles after a search
+            that found too few pairs. Most searches use about 2k vectors.
 
     Examples:
         >>> sparse = hj.eigenpairs(field, k=12, solver=hj.ShiftInvert(basis=60))
