@@ -20,6 +20,8 @@ _START = 30
 """The safety factor of `lanczos_bound` for start vectors with covariance D instead of P⁻¹, at least √cond(PD)."""
 
 Columns = Float[Array, "*shape b"]
+Step = tuple[Columns, Columns, Array, Array, Array]
+"""The vectors z_{j−1} and z_j, their factors 2σ_j/e and σ_j σ_{j−1} in the next step, and σ_j."""
 
 
 def chebyshev_recurrence(
@@ -66,26 +68,30 @@ def chebyshev_iteration(
     centre, half = (high + low) / 2, (high - low) / 2
     s = aligned((value - centre) / half, w)
 
+    def factors(twice: Array | int, following: Array, ratio: Array) -> tuple[Array, Array]:
+        return (twice * following / half).astype(w.dtype), (following * ratio).astype(w.dtype)
+
+    # A step computes the factors of the next one. If a step computed its own, XLA would divide for each entry of z.
+    def step(state: Step) -> Step:
+        before, z, grow, back, ratio = state
+        after = grow * (product(z) - centre.astype(w.dtype) * z + w) - back * before
+        following = 1 / (2 * s - ratio)
+        return z, after, *factors(2, following, ratio), following
+
     # On accelerators, each loop iteration takes two steps, so that new vectors overwrite old ones; with one step, XLA
     # would copy both vectors. If the number of steps is odd, an additional first step leads from z₀ = 0 to z₁.
     together = 2 if accelerators.at_hand() else 1
     missing = jnp.asarray((degree - 1) % together)
 
-    def step(n: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        before, z, ratio = state
-        following = jnp.where(n == 0, 1 / s, 1 / (2 * s - ratio))
-        grown = product(z) - centre.astype(w.dtype) * z + w
-        twice = jnp.where(n == 0, 1, 2) * following / half
-        after = twice.astype(w.dtype) * grown - (following * ratio).astype(w.dtype) * before
-        return z, after, following
-
-    def turn(number: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        for ahead in range(together):
-            state = step(1 - missing + together * number + ahead, state)
+    def turn(_: Array, state: Step) -> Step:
+        for _ in range(together):
+            state = step(state)
         return state
 
-    ratio = (1 - missing).astype(s.dtype) / s
-    first = jnp.zeros_like(w), (ratio / half).astype(w.dtype) * w, ratio
+    twice = 2 - missing.astype(s.dtype)
+    ratio = (twice - 1) / s
+    following = 1 / (twice * s - ratio)
+    first = jnp.zeros_like(w), (ratio / half).astype(w.dtype) * w, *factors(twice, following, ratio), following
     return jax.lax.fori_loop(0, (degree - 1 + missing) // together, turn, first)[1]
 
 
