@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from hks_jax.compilation import jit_quickly
 from hks_jax.fem.nodal import NodalPencil
+from hks_jax.fem.stencil import Stencil
 from hks_jax.linear.chebyshev import Columns, chebyshev_iteration, gershgorin, lanczos_bound
 from hks_jax.linear.products import aligned
 
@@ -74,15 +75,15 @@ def correction(
     plus the result is the filtered vector p(D⁻¹K)x / p(ζ).
     """
     dtype = residual.dtype
-    stiffness, mass = (
-        replace(matrix, coefficients=(matrix.coefficients / pencil.lumped[None]).astype(dtype)).of_columns()
-        for matrix in (pencil.stiffness, pencil.mass)
-    )
 
-    def further(y: Columns) -> Columns:
-        if pencil.mass.is_diagonal:
-            return y
-        return jax.lax.fori_loop(0, terms, lambda _, sum_: y + (sum_ - mass(sum_)), y)
+    def scaled(matrix: Stencil) -> Callable[[Columns], Columns]:
+        return replace(matrix, coefficients=(matrix.coefficients / pencil.lumped[None]).astype(dtype)).of_columns()
+
+    stiffness = scaled(pencil.stiffness)
+
+    def series() -> Columns:
+        mass = scaled(pencil.mass)
+        return run(lambda y: jax.lax.fori_loop(0, terms, lambda _, sum_: y + (sum_ - mass(sum_)), y))
 
     reference = jnp.minimum(value, band.low)
 
@@ -91,8 +92,11 @@ def correction(
         w = w - aligned(reference.astype(dtype), residual) * whole
         return chebyshev_iteration(lambda z: inverse(stiffness(z)), w, band.low, band.high, reference, degree)
 
+    def plain() -> Columns:
+        return run(lambda y: y)
+
     # The case ``terms`` = 0 is compiled separately, so that XLA fuses a whole step of the Chebyshev iteration.
-    return jax.lax.cond(jnp.asarray(terms) > 0, lambda: run(further), lambda: run(lambda y: y))
+    return plain() if pencil.mass.is_diagonal else jax.lax.cond(jnp.asarray(terms) > 0, series, plain)
 
 
 @jit_quickly()
