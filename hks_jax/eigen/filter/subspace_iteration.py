@@ -38,7 +38,7 @@ _SPARE_TOLERANCE = 0.1
 the convergence of the wanted ones as squares."""
 _MARGIN = 1.1
 """The safety factor of Weyl's law for the eigenvalue of the last vector."""
-_SPLIT, _APART = 0.1, 1.5
+_SPLIT, _APART = 0.05, 1.5
 """The Neumann series of the inverse mass gets more terms until the relative errors 1 − ψ(λ)/λ of eigenvalues λ near the
 last wanted eigenvalue differ by at most ``_SPLIT``, and until ψ(λ) is at least ``_APART`` times the last wanted
 eigenvalue for all λ above twice that eigenvalue."""
