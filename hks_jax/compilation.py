@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable
-from functools import cache, partial, wraps
+from functools import cache, wraps
 from typing import Any, ParamSpec, TypeVar
 
 import jax
@@ -87,7 +87,7 @@ _FEW = 1 << 19
 
 
 def numpy_where_known(most: int = _FEW, **settings: Any) -> Callable[[Callable[..., T]], Callable[..., T]]:
-    """Return a decorator for functions whose first argument is the array module, `numpy` or `jax.numpy`.
+    """Return a decorator for functions that compute with the library of their arrays (`library_of`).
 
     If the arguments are concrete, on a CPU, and have at most ``most`` entries, the function is evaluated without
     compilation, with NumPy arrays in place of JAX arrays and SciPy matrices in place of operators. Otherwise, the
@@ -95,13 +95,13 @@ def numpy_where_known(most: int = _FEW, **settings: Any) -> Callable[[Callable[.
     decide between NumPy and XLA, so that repeated computations on concrete arrays round equally.
     """
 
-    def decorate(function: Callable[..., T]) -> Callable[..., T]:
-        compiled = jit_quickly(**settings)(partial(function, jnp))
+    def decorate(function: Callable[P, T]) -> Callable[P, T]:
+        compiled = jit_quickly(**settings)(function)
 
         @wraps(function)
-        def call(*args: Any) -> T:
+        def call(*args: P.args, **kwargs: P.kwargs) -> T:
             is_small = sum(np.size(leaf) for leaf in jax.tree.leaves(args)) <= most
-            return by_numpy(partial(function, np), *args) if is_small and is_concrete_on_cpu(args) else compiled(*args)
+            return by_numpy(function, *args) if is_small and is_concrete_on_cpu(args) else compiled(*args)
 
         return call
 

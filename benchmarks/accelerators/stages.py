@@ -45,11 +45,6 @@ Stage = tuple[str, Callable, tuple, Any]
 """The name of a stage, its function, its arguments, and further arrays that live beside it."""
 
 
-def traced(function: Callable) -> Callable:
-    """Return a function of `numpy_where_known` as XLA computes it."""
-    return partial(function.__wrapped__, jnp)  # type: ignore[attr-defined]
-
-
 def array(*shape: int, dtype: Any = np.float32) -> jax.ShapeDtypeStruct:
     """Return the description of an array."""
     return jax.ShapeDtypeStruct(shape, dtype)
@@ -80,7 +75,7 @@ def stages(n: int, k: int) -> Iterator[Stage]:
     vectors, kept = array(k + 1, nodes), array(k, nodes)
 
     def quality(pencil: Any, vectors: Any, values: Any, following: Any) -> Any:
-        return traced(_quality)(pencil, vectors, values, following, None, 1, 1e-8, True, False)
+        return _quality(pencil, vectors, values, following, None, 1, 1e-8, True, False)
 
     def errors(pencil: Any, values: Any, times: Any) -> Any:
         flags, nothing = jnp.ones(k, bool), jnp.zeros(())
@@ -96,8 +91,8 @@ def stages(n: int, k: int) -> Iterator[Stage]:
     wanted = partial(_wanted, returned=k + 1)
     yield "wanted pairs", wanted, (fine, state), (own, matrices, coarse)
     of_nulls = pencil.mass, array(1, nodes), array(k + 1), vectors
-    yield "null vectors", traced(_with_null_modes), of_nulls, (own, pencil.stiffness)
-    yield "first k", lambda values, vectors: traced(_cut)(values, vectors, k), (array(k + 1), vectors), (own, matrices)
+    yield "null vectors", _with_null_modes, of_nulls, (own, pencil.stiffness)
+    yield "first k", lambda values, vectors: _cut(values, vectors, k), (array(k + 1), vectors), (own, matrices)
     yield "residuals", quality, (pencil, kept, array(k), one), tensors
     yield "errors", errors, (pencil, array(k), array(TIMES)), (tensors, kept)
     yield "signature", Diagonal().weighted, (array(TIMES, k), kept), (own, matrices)

@@ -4,7 +4,8 @@
 
 Every measurement is a process of its own, so that its peak memory is its own too; one that takes longer than the limit,
 or more memory than there is, is reported as such. Timed is the eigensolver alone, from assembled matrices to
-eigenpairs, compilation apart (the second call, where the first takes under four minutes). The residual is
+eigenpairs, compilation apart (the second call, where the first takes under four minutes). The peak of memory is that of
+the first call, because the second one begins beside its result. The residual is
 ‖Kφ − λMφ‖/‖Mφ‖/max(λ, λ₁).
 """
 
@@ -40,13 +41,13 @@ def measure_here(name: str, n: int, k: int, memory: float) -> None:
     if name == "eigsh, SuperLU":
         resource.setrlimit(resource.RLIMIT_AS, (int(memory * 1e9),) * 2)
         values, vectors, found = eigsh(pencil.stiffness.to_scipy(), pencil.mass.to_scipy(), k)
+        found["peak_GB"] = peak_memory()
     else:
         solver = {"chebyshev-filter": hj.ChebyshevFilter, "block-lanczos": hj.BlockLanczos}[name](tolerance=TOLERANCE)
         first, (values, vectors, _) = timed_once(solver.lowest, pencil, k)
-        found = {"seconds": first, "first_call_s": first}
+        found = {"seconds": first, "first_call_s": first, "peak_GB": peak_memory()}
         if first < 240:
             found["seconds"], (values, vectors, _) = timed_once(solver.lowest, pencil, k)
-    found["peak_GB"] = peak_memory()
     worst = float(relative_residuals(pencil, jnp.asarray(values), jnp.asarray(vectors)).max())
     print(json.dumps(found | {"worst_residual": worst, "eigenvalues": np.asarray(values).tolist()}))
 

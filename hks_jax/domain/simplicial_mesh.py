@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from hks_jax.arrays import StaticArray, describe_array
+from hks_jax.arrays import StaticArray, describe_array, library_of
 from hks_jax.checks import real_array
 from hks_jax.compilation import numpy_where_known
 from hks_jax.domain import spd
@@ -241,13 +241,14 @@ def _checked_metric(metric: Any, triangulation: Triangulation) -> Float[Array, "
 
 @numpy_where_known(static_argnums=(3, 4))
 def _tangential_metric(
-    xp: Any, edges: Any, tensors: Any, corners: Any, metric: MetricChoice, interpolation: Interpolation
+    edges: Any, tensors: Any, corners: Any, metric: MetricChoice, interpolation: Interpolation
 ) -> Any:
     """Return the metric of cells in the basis of their edges (n, 3, d), from tensors in space at corners (n, c)."""
-    frames = _orthonormal(xp, edges)
+    xp = library_of(edges)
+    frames = _orthonormal(edges)
     parts = matmul(frames.mT[:, None], tensors[corners], frames[:, None])
     # The tensors at all vertices of a cell, and not only their mean, must be positive definite.
-    parts = spd.nan_unless_positive(xp, parts)
+    parts = spd.nan_unless_positive(parts)
     # The logarithm of the tangential part is used, because the tensor in space may be indefinite.
     mean = xp.mean(parts, axis=1) if interpolation == "linear" else spd.exp(jnp.mean(spd.log(parts), axis=1))
     coordinates = matmul(frames.mT, edges)
@@ -255,24 +256,25 @@ def _tangential_metric(
 
 
 @numpy_where_known()
-def _edges_of(xp: Any, vertices: Any, cells: Any) -> Any:
+def _edges_of(vertices: Any, cells: Any) -> Any:
     """Return the edges v₁ − v₀, v₂ − v₀ … of each cell, as columns; NaN for inverted tetrahedra."""
     corners = vertices[cells]
-    return oriented(xp, (corners[:, 1:] - corners[:, :1]).mT)
+    return oriented((corners[:, 1:] - corners[:, :1]).mT)
 
 
 @numpy_where_known()
-def _induced_metric(xp: Any, edges: Any) -> Any:
-    return spd.nan_unless_positive(xp, matmul(edges.mT, edges))
+def _induced_metric(edges: Any) -> Any:
+    return spd.nan_unless_positive(matmul(edges.mT, edges))
 
 
-def oriented(xp: Any, frames: Any) -> Any:
+def oriented(frames: Any) -> Any:
     """Return the Jacobian matrices ∂x/∂ξ (..., 3, d) of cells, with NaN for inverted tetrahedra."""
-    return frames if frames.shape[-1] == 2 else spd.nan_unless(xp, spd.determinant(frames) > 0, frames)
+    return frames if frames.shape[-1] == 2 else spd.nan_unless(spd.determinant(frames) > 0, frames)
 
 
-def _orthonormal(xp: Any, edges: Any) -> Any:
+def _orthonormal(edges: Any) -> Any:
     """Return an orthonormal basis, as columns, of the plane of each triangle (by Gram–Schmidt) or of space."""
+    xp = library_of(edges)
     if edges.shape[-1] == 3:
         return xp.broadcast_to(xp.eye(3, dtype=edges.dtype), edges.shape)
     first, second = edges[..., 0], edges[..., 1]

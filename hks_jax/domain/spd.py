@@ -9,15 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hks_jax.arrays import library_of
 from hks_jax.compilation import numpy_where_known
 from hks_jax.linear.dense_eigh import differentiable_eigh
 from hks_jax.linear.products import matmul
 
 
 @numpy_where_known()
-def symmetrise(xp: Any, tensors: Any) -> Any:
+def symmetrise(tensors: Any) -> Any:
     """Return the symmetric part, ``(T + Tᵀ)/2``."""
-    return 0.5 * (tensors + xp.swapaxes(tensors, -1, -2))
+    return 0.5 * (tensors + library_of(tensors).swapaxes(tensors, -1, -2))
 
 
 def identity_outside(
@@ -28,7 +29,8 @@ def identity_outside(
 
 
 @numpy_where_known()
-def _identity_outside(xp: Any, tensors: Any, inside: Any) -> Any:
+def _identity_outside(tensors: Any, inside: Any) -> Any:
+    xp = library_of(tensors)
     return xp.where(inside[..., None, None], tensors, xp.eye(tensors.shape[-1], dtype=tensors.dtype))
 
 
@@ -44,7 +46,7 @@ def adjugate(tensors: Any) -> Any:
             return t[..., a, c] * t[..., b, d] - t[..., a, d] * t[..., b, c]
 
         rows = [[cofactor(j, i) for j in range(3)] for i in range(3)]
-    xp = np if isinstance(t, np.ndarray) else jnp
+    xp = library_of(t)
     return xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
@@ -95,14 +97,15 @@ def is_positive(t: Any) -> Any:
 
 
 # A product with NaN, unlike `where(…)`, makes the derivatives of invalid matrices NaN, too; `where(…)` makes them zero.
-def nan_unless(xp: Any, valid: Any, matrices: Any) -> Any:
+def nan_unless(valid: Any, matrices: Any) -> Any:
     """Return the matrices (..., i, j) of JAX or NumPy, with NaN in place of matrices that are not ``valid``."""
+    xp = library_of(matrices)
     return matrices * xp.where(valid, 1, xp.nan).astype(matrices.dtype)[..., None, None]
 
 
-def nan_unless_positive(xp: Any, tensors: Any) -> Any:
+def nan_unless_positive(tensors: Any) -> Any:
     """Return the matrices of JAX or NumPy, d = 2 or 3, with NaN in place of those that are not positive definite."""
-    return nan_unless(xp, is_positive(tensors), tensors)
+    return nan_unless(is_positive(tensors), tensors)
 
 
 positive_or_nan = numpy_where_known()(nan_unless_positive)

@@ -275,9 +275,9 @@ class TensorField(eqx.Module):
 
 
 @numpy_where_known(static_argnums=1)
-def _metric_of_diffusion(xp: Any, D: Any, metric: MetricChoice) -> Any:
+def _metric_of_diffusion(D: Any, metric: MetricChoice) -> Any:
     # In three dimensions −D and D have the same adjugate, so D is set to NaN where it is not positive definite.
-    return spd.metric_of_diffusion(spd.nan_unless_positive(xp, D), metric)
+    return spd.metric_of_diffusion(spd.nan_unless_positive(D), metric)
 
 
 def require_laplace_beltrami(field: TensorField, what: str) -> None:

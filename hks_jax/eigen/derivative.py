@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from hks_jax.accuracy import warn_of_accuracy
+from hks_jax.arrays import library_of
 from hks_jax.compilation import numpy_where_known
 from hks_jax.eigen.adjoints.complement import Adjoint, OfRows, Rows, Scalar, Values, Vectors, unsolved
 from hks_jax.eigen.quality import indistinct
@@ -109,15 +110,17 @@ def _lowest(solver: Eigensolver, k: int, report: Report, pencil: SymmetricPencil
 
 
 @numpy_where_known(static_argnums=2)
-def _cut(xp: Any, values: Any, vectors: Any, k: int) -> tuple[Any, Any, Any, Any]:
+def _cut(values: Any, vectors: Any, k: int) -> tuple[Any, Any, Any, Any]:
     """Return k pairs, the next eigenvalue and, if the solver returned more vectors than pairs, those after the k-th."""
+    xp = library_of(values)
     following = values[k] if len(values) > k else xp.asarray(xp.inf, values.dtype)
     return values[:k], vectors[:k], following, vectors[k:] if len(vectors) > len(values) else None
 
 
 @numpy_where_known()
-def _below(xp: Any, values: Any, rounding: Any) -> Any:
+def _below(values: Any, rounding: Any) -> Any:
     """Return the lowest eigenvalue minus the mean gap or, if all eigenvalues are equal, minus some rounding errors."""
+    xp = library_of(values)
     gap = (values[-1] - values[0]) / values.size
     return values[0] - xp.where(gap > rounding, gap, 1e3 * rounding)
 
@@ -135,7 +138,7 @@ def _by_numpy(adjoint: Adjoint, on_failure: OnFailure, constants: _Constants) ->
     k, rows = len(functions), np.asarray(functions)
     guards = np.asarray(vectors)[k:]
     eigenvalues = (np.asarray(values)[:k] + np.asarray(origin))[:, None]
-    _, inverse = gaps(np, np.asarray(values), k, np.asarray(indistinct(pencil, values.dtype)))
+    _, inverse = gaps(np.asarray(values), k, np.asarray(indistinct(pencil, values.dtype)))
 
     def outside(rhs: np.ndarray) -> np.ndarray:
         if not _solves(pencil, k, len(values)):
@@ -181,7 +184,7 @@ def _tangents(
     eigenvalues, guards = values[:k] + origin, vectors[k:]
     moved = change.mass.apply(functions)
     force = change.stiffness.apply(functions) - eigenvalues[:, None] * moved
-    _, inverse = gaps(jnp, values, k, indistinct(pencil, values.dtype))
+    _, inverse = gaps(values, k, indistinct(pencil, values.dtype))
 
     # `onto_guards` is symmetric, so it is its own transpose. JAX's automatic transpose would be several times slower.
     def onto_guards(force: Rows) -> Rows:
@@ -222,11 +225,12 @@ def _checked(on_failure: OnFailure, x: Rows) -> Rows:
 
 
 @numpy_where_known()
-def _with_null_modes(xp: Any, mass: Any, nulls: Any, values: Any, vectors: Any) -> tuple[Any, Any]:
+def _with_null_modes(mass: Any, nulls: Any, values: Any, vectors: Any) -> tuple[Any, Any]:
     """Replace the solver's approximations of null vectors by the pencil's null vectors.
 
     The eigenvalues of null vectors become 0, not about ±1e-13. All other vectors become M-orthogonal to null vectors.
     """
+    xp = library_of(values)
     product: Any
     inverse_cholesky: Any
     if xp is jnp:

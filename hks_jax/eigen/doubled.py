@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from hks_jax.arrays import library_of
 from hks_jax.compilation import numpy_where_known
 from hks_jax.eigen.eigenpairs import Eigenpairs, PencilEigenpairs, view
 from hks_jax.fem.pencil import Inclusions, MirrorPencil
@@ -135,8 +136,9 @@ class DoubledEigenpairs(Eigenpairs, eqx.Module):
 # their order. The problem with the smaller space could then have more of the lowest eigenvalues of the doubled domain
 # than `MirrorPencil.including` allows.
 @numpy_where_known(static_argnums=(1, 2))
-def _order(xp: Any, spectra: Any, including: Inclusions, k: int) -> Any:
+def _order(spectra: Any, including: Inclusions, k: int) -> Any:
     """Return the places (…, k) of the k lowest eigenvalues in the concatenated spectra of all problems."""
+    xp = library_of(spectra[0])
     keys: list[Any] = []
     for own, others in zip(spectra, including, strict=True):
         for key in (keys[j] for j in others[:-1]):
@@ -147,8 +149,9 @@ def _order(xp: Any, spectra: Any, including: Inclusions, k: int) -> Any:
 
 
 @numpy_where_known(static_argnums=2)
-def _in_order(xp: Any, values: Any, order: Any, axis: int) -> Any:
+def _in_order(values: Any, order: Any, axis: int) -> Any:
     """Return the values of all problems, along an axis, in the order of the k lowest eigenvalues."""
+    xp = library_of(order)
     whole = xp.concatenate(values, axis=axis)
     if order.ndim == 1:
         return xp.take(whole, order, axis=axis)
@@ -156,12 +159,14 @@ def _in_order(xp: Any, values: Any, order: Any, axis: int) -> Any:
 
 
 @numpy_where_known(static_argnums=1)
-def _over(xp: Any, values: Any, name: str) -> Any:
+def _over(values: Any, name: str) -> Any:
+    xp = library_of(values[0])
     return getattr(xp, name)(xp.stack(values), axis=0)
 
 
 @numpy_where_known(static_argnums=2)
-def _split(xp: Any, order: Any, kept: Any, sizes: tuple[int, ...]) -> Any:
+def _split(order: Any, kept: Any, sizes: tuple[int, ...]) -> Any:
     """Return the mask of each problem's pairs that are among the kept ones of the k lowest."""
+    xp = library_of(order)
     problem = xp.asarray(np.repeat(np.arange(len(sizes)), sizes))[order]
     return [xp.arange(size) < xp.sum(kept & (problem == i)) for i, size in enumerate(sizes)]

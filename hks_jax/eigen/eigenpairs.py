@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hks_jax.arrays import describe_array, jax_array
+from hks_jax.arrays import describe_array, jax_array, library_of
 from hks_jax.compilation import numpy_where_known
 from hks_jax.domain.tensor_checks import MANY
 from hks_jax.eigen.multiplets import MultipletChoice, Spectrum, is_unconfirmed, kept_of, number_cut, numbered
@@ -363,7 +363,8 @@ class PencilEigenpairs(Eigenpairs, eqx.Module):
 
 
 @numpy_where_known()
-def _first_beyond(xp: Any, kept: Any, values: Any, following: Any) -> Any:
+def _first_beyond(kept: Any, values: Any, following: Any) -> Any:
+    xp = library_of(values)
     return xp.append(values, following)[xp.sum(kept)]
 
 
@@ -394,10 +395,11 @@ def _anisotropy(pencils: list[Pencil]) -> float:
 
 
 @numpy_where_known()
-def _uncertain(xp: Any, kept: Any, rounding: Any, values: Any) -> Any:
-    return kept & (rounding > UNCERTAIN * xp.abs(values))
+def _uncertain(kept: Any, rounding: Any, values: Any) -> Any:
+    return kept & (rounding > UNCERTAIN * abs(values))
 
 
 @numpy_where_known()
-def _all_finite(xp: Any, arrays: list[Any]) -> Any:
+def _all_finite(arrays: list[Any]) -> Any:
+    xp = library_of(arrays[0])
     return xp.all(xp.stack([xp.all(xp.isfinite(array)) for array in arrays]))

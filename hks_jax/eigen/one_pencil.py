@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hks_jax.arrays import jax_array
+from hks_jax.arrays import jax_array, library_of
 from hks_jax.compilation import is_concrete_on_cpu, numpy_where_known
 from hks_jax.eigen.derivative import solved
 from hks_jax.eigen.eigenpairs import UNCERTAIN, PencilEigenpairs
@@ -113,8 +113,9 @@ def _judged(
 
 
 @numpy_where_known()
-def _with_small(xp: Any, values: Any, constant: Any, zero: Any, small: Any) -> Any:
+def _with_small(values: Any, constant: Any, zero: Any, small: Any) -> Any:
     """Replace eigenvalues near zero by ``small``; they keep their derivatives."""
+    xp = library_of(values)
     return xp.where(zero, small + (values - constant), values)
 
 
@@ -155,7 +156,6 @@ def _near_zero(
 
 @numpy_where_known(most=3 << 18, static_argnames=("n_null", "tolerance", "null_space_known", "stored"))
 def _quality(
-    xp: Any,
     pencil: Any,
     vectors: Any,
     values: Any,
@@ -172,9 +172,10 @@ def _quality(
     Otherwise it is divided by the distance of its eigenvalue from the lowest one, or from a known lower bound, but at
     least by the mean gap. If all eigenvalues are equal within rounding, the divisor is the result of `largest_of`.
     """
+    xp = library_of(values)
     measure = measured_on_host if xp is np else measure_pairs
     (_, residuals, twice), k = measure(pencil, vectors, values), values.size
-    size = largest_of(xp, pencil.stiffness, pencil.mass)
+    size = largest_of(pencil.stiffness, pencil.mass)
     rounding = 4 * xp.finfo(values.dtype).eps * size
     if null_space_known:
         scale = xp.maximum(xp.abs(values), xp.abs(values[min(n_null, k - 1)]))
@@ -184,7 +185,7 @@ def _quality(
         scale = xp.maximum(values - lowest, (last - values[0]) / k)
         scale = xp.where(scale > 100 * rounding, scale, size)
     scale = xp.where(scale > 0, scale, xp.where(size > 0, size, 1)).astype(values.dtype)
-    converged = (residuals <= allowed_residuals(scale, rounding, tolerance, xp, stored)) & ~twice
+    converged = (residuals <= allowed_residuals(scale, rounding, tolerance, stored)) & ~twice
     converged = converged & (values >= 0) if null_space_known else converged
     tolerance = xp.clip(rounding / scale[-1], 1e-6, 1e-3).astype(values.dtype)
     return residuals / scale, converged, xp.abs(values) <= rounding, tolerance

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hks_jax.arrays import library_of
 from hks_jax.compilation import numpy_where_known
 from hks_jax.linear.products import products_with_columns, row_blocks
 from hks_jax.linear.symmetric_pencil import SymmetricPencil
@@ -65,13 +66,14 @@ def measured_on_host(
     return values, residuals, twice
 
 
-def allowed_residuals(scale: Any, rounding: Any, tolerance: float, xp: Any = jnp, stored: bool = False) -> Any:
+def allowed_residuals(scale: Any, rounding: Any, tolerance: float, stored: bool = False) -> Any:
     """Return the largest residuals ‖Kφ − λMφ‖ / ‖Mφ‖ at which pairs count as converged.
 
     The tolerance is relative to ``scale``, the larger of |λ| and a typical eigenvalue. Residuals up to the level of
     rounding are accepted too, but only up to one per cent of ``scale``, because a less accurate pair is useless. If
     the pairs were only ``stored`` in low precision, the residuals are those of the stored vectors, and have no limit.
     """
+    xp = library_of(scale)
     return xp.maximum(tolerance * scale, rounding if stored else xp.minimum(rounding, _EXCUSED * scale))
 
 
@@ -88,9 +90,11 @@ def largest(pencil: SymmetricPencil) -> Float[Array, ""]:
     return _largest(pencil.stiffness, pencil.mass)
 
 
-def largest_of(xp: Any, stiffness: Any, mass: Any) -> Any:
+def largest_of(stiffness: Any, mass: Any) -> Any:
     """Return the result of `largest` for matrices of JAX or SciPy."""
-    masses, entries = mass.diagonal(), stiffness.data if xp is np else stiffness.flat()
+    masses = mass.diagonal()
+    xp = library_of(masses)
+    entries = stiffness.data if xp is np else stiffness.flat()
     mean = xp.sum(xp.abs(entries)) / masses.size / xp.max(masses)
     return xp.maximum(4 * xp.max(xp.abs(stiffness.diagonal()) / masses), mean)
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from hks_jax.arrays import library_of
 from hks_jax.compilation import numpy_where_known
 from hks_jax.eigen.adjoints.complement import OfRows, Rows, Scalar, Values
 from hks_jax.eigen.quality import indistinct
@@ -45,12 +46,13 @@ def _with_rotations_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 @jax.checkpoint
 def _rotations(frame: Rows, values: Values, rounding: Scalar, change: Pencil) -> Rows:
     stiffness, mass = changes_between(frame, change)
-    apart, inverse = gaps(jnp, values, len(values), rounding)
+    apart, inverse = gaps(values, len(values), rounding)
     return matmul(jnp.where(apart, inverse * (stiffness - values[:, None] * mass), -mass / 2), frame)
 
 
-def gaps(xp: Any, values: Any, k: int, rounding: Any) -> tuple[Any, Any]:
+def gaps(values: Any, k: int, rounding: Any) -> tuple[Any, Any]:
     """Return the mask (k, p) of pairs of distinct eigenvalues, and 1/(λᵢ − λⱼ), which is 0 for equal eigenvalues."""
+    xp = library_of(values)
     gap, above = values[:k, None] - values[None], values - xp.nanmin(values)
     least = xp.sqrt(xp.finfo(values.dtype).eps) * xp.maximum(above[:k, None], above[None])
     # The bound of rounding errors is a worst case, which may exceed even the range of all eigenvalues. This limit holds
@@ -101,8 +103,9 @@ def _of_simple_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 
 @numpy_where_known(static_argnums=4)
-def _is_multiple(xp: Any, values: Any, following: Any, kept: Any, rounding: Any, fixed: bool) -> Any:
+def _is_multiple(values: Any, following: Any, kept: Any, rounding: Any, fixed: bool) -> Any:
     """Return the mask (k) of pairs that are not kept or whose eigenvalue is multiple, except fixed null vectors."""
+    xp = library_of(values)
     size = xp.maximum(xp.abs(values), values - values[:1])
     least = xp.maximum(xp.finfo(values.dtype).eps ** 0.5 * size, rounding)
     near = xp.abs(values[:, None] - values[None]) <= least[:, None]

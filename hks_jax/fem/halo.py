@@ -11,13 +11,14 @@ import numpy as np
 from jax.sharding import AxisType, Mesh
 from jaxtyping import Array, Float
 
+from hks_jax.arrays import library_of
+
 
 def with_rim(x: Any, periodic: tuple[bool, ...], first: int = 0) -> Any:
     """Pad x by one node at both ends of axis ``first`` and the axes after it: periodically, or by zeros."""
-    pad = np.pad if isinstance(x, np.ndarray) else jnp.pad
     for axis, wraps in enumerate(periodic, start=first):
         widths = [(1, 1) if a == axis else (0, 0) for a in range(x.ndim)]
-        x = pad(x, widths, mode="wrap" if wraps else "constant")
+        x = library_of(x).pad(x, widths, mode="wrap" if wraps else "constant")
     return x
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hks_jax.arrays import library_of
 from hks_jax.checks import real_array
 from hks_jax.compilation import jit_quickly, numpy_where_known
 from hks_jax.domain import spd
@@ -69,8 +70,9 @@ def assemble_grid(
 
 
 @numpy_where_known()
-def _diffusion(xp: Any, metric: Any, domain: Any) -> tuple[Any, Any]:
+def _diffusion(metric: Any, domain: Any) -> tuple[Any, Any]:
     """Return the tensors D = T⁻¹ of Fick's operator, and √|D| at the nodes of the domain and 1 elsewhere."""
+    xp = library_of(domain)
     tensors = spd.inverse(metric)
     return tensors, xp.sqrt(xp.where(domain, spd.determinant(tensors), 1))
 
@@ -322,7 +324,7 @@ def assemble_mesh(
     shape = len(space.cells), element.weights.size
     if curved:
         slopes = jnp.asarray(element.gradients, nodes.dtype)
-        jacobians = oriented(jnp, jnp.einsum("qia,nix->nqxa", slopes, nodes[space.cells], precision="highest"))
+        jacobians = oriented(jnp.einsum("qia,nix->nqxa", slopes, nodes[space.cells], precision="highest"))
         metric = spd.positive_or_nan(jnp.einsum("nqxa,nqxb->nqab", jacobians, jacobians, precision="highest"))
     else:
         metric, jacobians = (jnp.broadcast_to(x[:, None], (*shape, *x.shape[1:])) for x in (mesh.metric, mesh._edges))

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from hks_jax.arrays import library_of
 from hks_jax.compilation import jit_quickly, numpy_where_known
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_checks import Interpolation
@@ -39,7 +40,8 @@ def mean_diffusivity(metric: SampledMetric | None, space: FunctionSpace, dtype: 
 
 
 @numpy_where_known()
-def _mean_of_nodes(xp: Any, tensors: Any, domain: Any) -> Any:
+def _mean_of_nodes(tensors: Any, domain: Any) -> Any:
+    xp = library_of(tensors)
     d = tensors.shape[-1]
     inverse = spd.inverse(xp.where(domain[..., None, None], tensors, xp.eye(d, dtype=tensors.dtype)))
     mean = sum(inverse[..., a, a] for a in range(d)) / d
@@ -49,10 +51,11 @@ def _mean_of_nodes(xp: Any, tensors: Any, domain: Any) -> Any:
 # If the edges of a cell are the columns CE of an orthonormal basis E of its plane, the metric T in E has the matrix
 # g = CᵀTC in the basis of the edges, and the metric of space has G = CᵀC. So trace(T⁻¹) = trace(Cg⁻¹Cᵀ) = trace(g⁻¹G).
 @numpy_where_known()
-def _mean_of_cells(xp: Any, tensors: Any, of_space: Any) -> Any:
+def _mean_of_cells(tensors: Any, of_space: Any) -> Any:
     """Return the mean of trace(T⁻¹)/d, weighted by the volumes of the cells in space."""
+    xp = library_of(tensors)
     trace = (spd.inverse(tensors) * of_space).sum((-2, -1))  # both matrices are symmetric
-    return _mean(xp, trace / tensors.shape[-1], xp.sqrt(spd.determinant(of_space)))
+    return _mean(trace / tensors.shape[-1], xp.sqrt(spd.determinant(of_space)))
 
 
 class Resolution(eqx.Module):
@@ -101,8 +104,9 @@ def resolution_of(metric: SampledMetric, space: FunctionSpace, lumped: bool, can
 # of single eigenvalues is of second order: −Σ_{a<b} g^ab kₐkᵦ (hₐ²kₐ² + hᵦ²kᵦ²)/6 cancels only in the mean over the
 # heat kernel. Since E kₐ³kᵦ = 3gₐₐgₐᵦ/4t², the sum of its terms' sizes, times t, is Σ_{a<b}
 # |g^ab gₐᵦ| (hₐ²gₐₐ + hᵦ²gᵦᵦ)/8t.
-def _dispersion(xp: Any, tensors: Any, spacing: Any, lumped: bool, cancelling: bool) -> tuple[Any, Any]:
+def _dispersion(tensors: Any, spacing: Any, lumped: bool, cancelling: bool) -> tuple[Any, Any]:
     """Return the coefficients `Resolution.dispersion` and `Resolution.of_eigenvalues`."""
+    xp = library_of(tensors)
     inverse, d = spd.inverse(tensors), tensors.shape[-1]
     if cancelling:
         scaled = tensors * spacing[:, None] * spacing
@@ -129,8 +133,9 @@ def _dispersion(xp: Any, tensors: Any, spacing: Any, lumped: bool, cancelling: b
 # covariance A⁻¹, the missing energy is δAeₐ·A⁻¹δAeₐ/12Aₐₐ, relative to the energy of p along one axis. The estimate
 # holds for √t above the length on which the metric varies; for smaller t only its order of magnitude is right.
 # Fick's operator has the flux matrix A = D = T⁻¹.
-def _turning(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...], fick: bool) -> Any:
+def _turning(tensors: Any, domain: Any, periodic: tuple[bool, ...], fick: bool) -> Any:
     """Return the relative error (*shape) of eigenvalues due to the variation of tensors between neighbours."""
+    xp = library_of(tensors)
     determinant = spd.determinant(tensors)[..., None, None]
     root = determinant if fick else xp.sqrt(determinant)
     flux, reciprocal = spd.adjugate(tensors) / root, tensors * (root / determinant)
@@ -139,7 +144,7 @@ def _turning(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...], fic
         jump = xp.roll(flux[..., a], -1, a) - flux[..., a]
         half = 0.5 * reciprocal / flux[..., a, a, None, None]
         both = half + xp.roll(half, -1, a)
-        pairs = _neighbours(xp, domain, a, wraps)
+        pairs = _neighbours(domain, a, wraps)
         energy = xp.where(pairs, (jump[..., :, None] * both * jump[..., None, :]).sum((-2, -1)), 0)
         count = pairs.astype(energy.dtype) + xp.roll(pairs, 1, a).astype(energy.dtype)
         total = total + (energy + xp.roll(energy, 1, a)) / (12 * xp.maximum(count, 1))
@@ -150,10 +155,9 @@ def _turning(xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...], fic
 # derivative of the interpolated quantity. The mean of ξ(h − ξ)/2 between the nodes is h²/12. The relative error of the
 # density √|T| is half the trace of T⁻¹ times the error of T. The relative error of the volume element is therefore
 # Σₐ hₐ² tr(T⁻¹∂ₐ²T)/24 if T is interpolated, and Σₐ hₐ² ∂ₐ²log|T|/24 if log T is interpolated.
-def _swelling(
-    xp: Any, tensors: Any, domain: Any, periodic: tuple[bool, ...], interpolation: Interpolation
-) -> tuple[Any, Any]:
+def _swelling(tensors: Any, domain: Any, periodic: tuple[bool, ...], interpolation: Interpolation) -> tuple[Any, Any]:
     """Return the size of the mean of the volume element's relative error, and its standard deviation."""
+    xp = library_of(tensors)
     determinant, inverse = spd.determinant(tensors), spd.inverse(tensors)
     density = xp.sqrt(determinant)
     total, inner = xp.zeros((), tensors.dtype), domain
@@ -165,22 +169,24 @@ def _swelling(
         else:
             logarithm = xp.log(determinant)
             error = (xp.roll(logarithm, 1, a) + xp.roll(logarithm, -1, a) - 2 * logarithm) / 24
-        pairs = _neighbours(xp, domain, a, wraps)
+        pairs = _neighbours(domain, a, wraps)
         between = pairs & xp.roll(pairs, 1, a)
-        total, inner = total + _mean(xp, error, xp.where(between, density, 0)), inner & between
+        total, inner = total + _mean(error, xp.where(between, density, 0)), inner & between
         of_nodes = of_nodes + error
     weight = xp.where(inner, density, 0)
-    variance = _mean(xp, (of_nodes - _mean(xp, of_nodes, weight)) ** 2, weight)
+    variance = _mean((of_nodes - _mean(of_nodes, weight)) ** 2, weight)
     return xp.abs(total), xp.sqrt(variance)
 
 
-def _mean(xp: Any, x: Any, weight: Any) -> Any:
+def _mean(x: Any, weight: Any) -> Any:
     """Return the weighted mean, or 0 if all weights are 0."""
+    xp = library_of(x)
     return xp.sum(weight * x) / xp.maximum(xp.sum(weight), xp.finfo(x.dtype).tiny)
 
 
-def _neighbours(xp: Any, domain: Any, axis: int, wraps: bool) -> Any:
+def _neighbours(domain: Any, axis: int, wraps: bool) -> Any:
     """Return a mask (*shape) of the nodes that are in the domain and have a next node in the domain along the axis."""
+    xp = library_of(domain)
     pairs = xp.logical_and(domain, xp.roll(domain, -1, axis))
     if wraps:
         return pairs
@@ -190,21 +196,22 @@ def _neighbours(xp: Any, domain: Any, axis: int, wraps: bool) -> Any:
 
 @numpy_where_known(most=1 << 21, static_argnums=(2, 3, 4))
 def _of_grid(
-    xp: Any, metric: SampledMetric, domain: Any, periodic: tuple[bool, ...], lumped: bool, cancelling: bool
+    metric: SampledMetric, domain: Any, periodic: tuple[bool, ...], lumped: bool, cancelling: bool
 ) -> tuple[Any, ...]:
+    xp = library_of(domain)
     d, dtype, spacing = metric.tensors.shape[-1], metric.tensors.dtype, metric.spacing
     assert spacing is not None
     tensors = xp.where(domain[..., None, None], metric.tensors, xp.eye(d, dtype=dtype))
     along = [spacing[a] ** 2 * tensors[..., a, a] for a in range(d)]
-    turning = _turning(xp, tensors, domain, periodic, metric.fick)
+    turning = _turning(tensors, domain, periodic, metric.fick)
     measured = spd.inverse(tensors) if metric.fick else tensors
-    swelling, unevenness = _swelling(xp, measured, domain, periodic, metric.interpolation)
+    swelling, unevenness = _swelling(measured, domain, periodic, metric.interpolation)
     if metric.fick:
         # Fick's volume element is exact. An error of √|D| is one of the eigenvalues to the power d/2, and so of the
         # signature, proportional to λ^(d/2) at small times.
         turning, swelling, unevenness = turning + swelling, xp.zeros_like(swelling), xp.zeros_like(unevenness)
     width = xp.sqrt(xp.max(xp.stack(along), axis=0))
-    return width, *_dispersion(xp, tensors, spacing, lumped, cancelling), turning, swelling, unevenness
+    return width, *_dispersion(tensors, spacing, lumped, cancelling), turning, swelling, unevenness
 
 
 _BIAS = (0.03, 0.22)

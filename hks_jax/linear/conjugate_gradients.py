@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
+from hks_jax.arrays import library_of
 from hks_jax.linear.loops import when, while_loop
 from hks_jax.linear.products import matmul, products_with_columns
 
@@ -40,7 +41,7 @@ class Solution(NamedTuple):
     @property
     def converged(self) -> Float[Array, "n b"]:
         """The solutions; NaN for columns that did not converge."""
-        xp = self.x.__array_namespace__()
+        xp = library_of(self.x)
         return xp.where(self.errors <= 1, self.x, xp.nan)
 
 
@@ -63,7 +64,7 @@ def conjugate_gradients(
             matrices. Reorthogonalisation requires JAX arrays with b = 1. If ``orthogonal`` and ``first`` are true,
             ``product(x, first)`` must return the right-hand side, which may share compiled operations with products.
     """
-    xp, n = rhs.__array_namespace__(), len(rhs)
+    xp, n = library_of(rhs), len(rhs)
 
     def restarted(both: tuple[Array, Array]) -> tuple[Array, Array]:
         assert clean is not None

@@ -11,6 +11,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
+from hks_jax.arrays import library_of
 from hks_jax.linear import accelerators
 from hks_jax.linear.linear_map import with_transpose
 
@@ -40,8 +41,7 @@ def inner_products(basis: Float[Array, "m n"], block: Float[Array, "b n"]) -> Fl
 
 def matmul(*factors: Any) -> Any:
     """Return the product of (batches of) matrices of JAX or NumPy, on every device in the precision of their dtype."""
-    by_numpy = all(isinstance(factor, np.ndarray) for factor in factors)
-    return reduce(np.matmul if by_numpy else partial(jnp.matmul, precision="highest"), factors)
+    return reduce(np.matmul if library_of(*factors) is np else partial(jnp.matmul, precision="highest"), factors)
 
 
 def batched_with_columns(matrices: Float[Array, "m i j"], columns: Float[Array, "m j b"]) -> Float[Array, "m i b"]:

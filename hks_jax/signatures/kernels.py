@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hks_jax.arrays import nan_is_meant
+from hks_jax.arrays import library_of, nan_is_meant
 from hks_jax.checks import require_count, require_number, require_real
 from hks_jax.compilation import numpy_where_known
 from hks_jax.eigen.eigenpairs import Eigenpairs, require_pairs
@@ -131,7 +131,8 @@ def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Arr
 
 
 @numpy_where_known()
-def _largest_exponents(xp: Any, energies: Any, sigma: Any, values: Any, kept: Any) -> Any:
+def _largest_exponents(energies: Any, sigma: Any, values: Any, kept: Any) -> Any:
+    xp = library_of(energies)
     positive = kept & (values > 0)
     logs = xp.log(xp.where(positive, values, 1))
     exponents = xp.where(positive[None], -(((energies[:, None] - logs[None]) / sigma) ** 2) / 2, -xp.inf)

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.arrays import ByKey, nan_is_meant
+from hks_jax.arrays import ByKey, library_of, nan_is_meant
 from hks_jax.checks import real_array, require_number, require_real
 from hks_jax.compilation import numpy_where_known
 from hks_jax.eigen.eigenpairs import Eigenpairs, require_pairs
@@ -125,7 +125,8 @@ def reconstruct(pairs: Eigenpairs, c: Any) -> Float[Array, "*functions_and_shape
 
 
 @numpy_where_known()
-def _sum(xp: Any, coefficients: Any, kept: Any, modes: Any) -> Any:
+def _sum(coefficients: Any, kept: Any, modes: Any) -> Any:
+    xp = library_of(coefficients)
     m = coefficients.shape[1]
     return matmul(xp.where(kept[None, :m], coefficients, 0), modes[:m])
 
@@ -176,19 +177,21 @@ def energy(pairs: Eigenpairs, f: Any, diffusivity: Any = None) -> ModeEnergies:
 # The residual f − Σcⱼφⱼ of the fit is orthogonal to all modes. So the residual of the first i modes is the sum of the
 # squared norms of the fit's residual and of Σ_{j>i} cⱼφⱼ, which is a sum over j > i of the ``terms``.
 @numpy_where_known()
-def _terms(xp: Any, c: Any, gram: Any) -> Any:
+def _terms(c: Any, gram: Any) -> Any:
+    xp = library_of(c)
     return c * (2 * matmul(c, xp.tril(gram, -1)) + xp.diagonal(gram)[None] * c)
 
 
 @numpy_where_known()
-def _residuals(xp: Any, measure: Any, rows: Any, known: Any, c: Any, modes: Any, terms: Any) -> tuple[Any, Any, Any]:
+def _residuals(measure: Any, rows: Any, known: Any, c: Any, modes: Any, terms: Any) -> tuple[Any, Any, Any]:
     """Return the residuals and the shares of variance (s, k), and ∫f² (s)."""
+    xp = library_of(c)
 
     def integral(u: Any) -> Any:
-        return xp.sum(u * _weighted(xp, measure, u), axis=1)
+        return xp.sum(u * _weighted(measure, u), axis=1)
 
     total, one = integral(rows), known[None]
-    mean = xp.sum(_weighted(xp, measure, rows) * one, axis=1) / integral(one)
+    mean = xp.sum(_weighted(measure, rows) * one, axis=1) / integral(one)
     variance = integral(rows - mean[:, None] * one)
     beyond = xp.cumsum(terms[:, ::-1], axis=1)[:, ::-1] - terms
     left = integral((rows - matmul(c, modes)) * one)
@@ -211,8 +214,9 @@ def lengths_of(pairs: Eigenpairs, diffusivity: Any = None) -> tuple[Float[Array,
 # A Gaussian of standard deviation σ multiplies a wave cos(ξ·x) by exp(−σ²|ξ|²/2), which is ½ for σ = √(2 ln2)/|ξ|. Its
 # full width at half maximum is 2√(2 ln2) σ = 4 ln2/|ξ|.
 @numpy_where_known()
-def _lengths(xp: Any, values: Any, diffusivity: Any) -> tuple[Any, Any]:
+def _lengths(values: Any, diffusivity: Any) -> tuple[Any, Any]:
     """Return the wavelength 2π/|ξ| and the width 4 ln2/|ξ| for |ξ|² = λ/D; infinite where λ ≤ 0."""
+    xp = library_of(values)
     positive = values > 0
     lengths = xp.where(positive, xp.sqrt(diffusivity / xp.where(positive, values, 1)), xp.inf)
     return 2 * math.pi * lengths, 4 * math.log(2.0) * lengths
@@ -356,25 +360,27 @@ def _of_doubled(pairs: Eigenpairs, coefficients: Float[Array, "s k0"]) -> Float[
     return pairs.of_even(coefficients if len(pairs.problems) == 1 else math.sqrt(len(pairs.problems)) * coefficients)
 
 
-def _weighted(xp: Any, measure: Any, rows: Any) -> Any:
+def _weighted(measure: Any, rows: Any) -> Any:
     """Return weights w (s, n) for nodal values of functions u: w·φ = ∫φu, as `Pencil.integrals` does."""
+    xp = library_of(rows)
     mass, row_sums = measure
     return (mass @ rows.T).T if row_sums is None else xp.where(xp.isinf(row_sums), 0, row_sums)[None] * rows
 
 
 @numpy_where_known()
-def _chosen(xp: Any, modes: Any, kept: Any) -> Any:
-    return xp.where(kept[:, None], modes, 0)
+def _chosen(modes: Any, kept: Any) -> Any:
+    return library_of(modes).where(kept[:, None], modes, 0)
 
 
 @numpy_where_known()
-def _products(xp: Any, measure: Any, modes: Any, rows: Any, measured: Any) -> Any:
+def _products(measure: Any, modes: Any, rows: Any, measured: Any) -> Any:
     """Return the inner products (s, k) of rows, which are 0 at unmeasured nodes, with the modes at measured nodes."""
+    xp = library_of(rows)
     own = modes if measured is None else xp.where(measured[None], modes, 0)
     if len(own) < len(rows):  # the mass is symmetric: it multiplies the smaller factor
-        own = _weighted(xp, measure, own)
+        own = _weighted(measure, own)
     else:
-        rows = _weighted(xp, measure, rows)
+        rows = _weighted(measure, rows)
     return inner_products(own, rows) if xp is jnp else rows @ own.T
 
 
@@ -385,8 +391,9 @@ def _gram(measure: Any, modes: Any, measured: Any, kept: Any) -> Float[Array, "k
 
 
 @numpy_where_known()
-def _solved(xp: Any, gram: Any, products: Any) -> tuple[Any, Any]:
+def _solved(gram: Any, products: Any) -> tuple[Any, Any]:
     """Return the coefficients, NaN if they are not determined, and the least eigenvalue of the Gram matrix."""
+    xp = library_of(gram)
     values, vectors = np.linalg.eigh(gram) if xp is np else lapack.eigh(jax.lax.stop_gradient(gram))
     determined = values[0] > _negligible(gram.dtype)
     divisors = xp.where(determined, values, 1)[:, None]

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hks_jax.arrays import nan_is_meant, nan_outside
+from hks_jax.arrays import library_of, nan_is_meant, nan_outside
 from hks_jax.compilation import jit_quickly, numpy_where_known
 from hks_jax.domain.components import boundary_nodes
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
@@ -145,8 +145,9 @@ def _estimate(pencil: Pencil, rim: Bool[np.ndarray, "*shape"], times: Float[Arra
 
 
 @numpy_where_known(most=_ON_HOST)
-def _hitting(xp: Any, stiffness: Any, mass: Any, inner: Any, times: Any) -> Any:
+def _hitting(stiffness: Any, mass: Any, inner: Any, times: Any) -> Any:
     """Return exp(−log²(u)/4) at the unknowns, for the solution u at each time."""
+    xp = library_of(times)
     scale, inside = times / 4, inner[:, None]
     one = xp.where(inside, (mass @ xp.ones(inner.size, times.dtype))[:, None], 0) * xp.ones_like(times)
     diagonal = xp.where(inside, mass.diagonal()[:, None] + scale * stiffness.diagonal()[:, None], 1)
@@ -183,12 +184,13 @@ def half_free(pairs: Eigenpairs, first: Any, last: Any) -> Float[Array, ""]:
 
 
 @numpy_where_known()
-def _candidates(xp: Any, first: Any, last: Any) -> Any:
-    return xp.geomspace(first, last, _CANDIDATES, dtype=first.dtype)
+def _candidates(first: Any, last: Any) -> Any:
+    return library_of(first).geomspace(first, last, _CANDIDATES, dtype=first.dtype)
 
 
 @numpy_where_known()
-def _time_of_half(xp: Any, share: Any, times: Any) -> Any:
+def _time_of_half(share: Any, times: Any) -> Any:
+    xp = library_of(share)
     share = np.minimum.accumulate(share) if xp is np else jax.lax.cummin(share)
     # The share decreases, so that the negative shares are ascending.
     return xp.exp(xp.interp(-0.5, -share, xp.log(times)))

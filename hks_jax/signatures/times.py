@@ -9,6 +9,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Bool, Float
 
+from hks_jax.arrays import library_of
 from hks_jax.checks import checked_times, require_count
 from hks_jax.compilation import numpy_where_known
 from hks_jax.domain.components import active_elements, boundary_nodes, label_nodes
@@ -61,7 +62,9 @@ def positive_range(pairs: Eigenpairs) -> tuple[Array, Array]:
 
 
 @numpy_where_known()
-def _ends(xp: Any, values: Any, kept: Any, tolerance: Any) -> tuple[Any, Any]:
+def _ends(values: Any, kept: Any, tolerance: Any) -> tuple[Any, Any]:
+    xp = library_of(values)
+
     def mean_of_copies(value: Any) -> Any:
         copies = kept & (xp.abs(values - value) <= tolerance * value)
         return xp.sum(xp.where(copies, values, 0)) / xp.sum(copies, dtype=values.dtype)

@@ -15,7 +15,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.arrays import describe_array, nan_is_meant
+from hks_jax.arrays import describe_array, library_of, nan_is_meant
 from hks_jax.compilation import jit_quickly, numpy_where_known
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.resolution import Resolution
@@ -149,9 +149,10 @@ def _of_spectrum(pairs: Eigenpairs, at: Float[Array, " n"]) -> tuple[Any, ...]:
 
 @numpy_where_known(static_argnums=(5, 6))
 def _of_eigenvalues(
-    xp: Any, values: Any, kept: Any, next_eigenvalue: Any, bottom: Any, at: Any, dimension: int, by_weyl: bool
+    values: Any, kept: Any, next_eigenvalue: Any, bottom: Any, at: Any, dimension: int, by_weyl: bool
 ) -> tuple[Any, ...]:
     """Return `tail`, `smallest_time` and, if the spectrum follows Weyl's law, the moments for `_resolution_bias`."""
+    xp = library_of(values)
     # Weyl's law counts from the bottom of the spectrum, which a potential shifts.
     values, next_eigenvalue = values - bottom, next_eigenvalue - bottom
     complete = xp.isinf(next_eigenvalue)
@@ -159,11 +160,11 @@ def _of_eigenvalues(
     count = xp.sum(kept, dtype=at.dtype)
     last = xp.max(xp.where(kept, values, 0))
     if by_weyl:
-        left, least = beyond_by_weyl(xp, count, dimension, following * at), resolving(TAIL_LIMIT, dimension)
+        left, least = beyond_by_weyl(count, dimension, following * at), resolving(TAIL_LIMIT, dimension)
     else:
         following = (following + last) / 2  # because there may be few eigenvalues, as in `truncation_map`
         mean = xp.sum(xp.where(kept, values, 0)) / (count * following)
-        exponent = xp.maximum(_exponent(xp, mean), dimension / 2)
+        exponent = xp.maximum(_exponent(mean), dimension / 2)
         left = xp.asarray(beyond(*map(jnp.asarray, (count, exponent, following * at))))
         least = xp.interp(exponent, *(xp.asarray(x, at.dtype) for x in (_EXPONENTS, _RESOLVING)))
     exponents = at[:, None] * values[None]
@@ -173,25 +174,24 @@ def _of_eigenvalues(
     if not by_weyl:
         return tail, smallest, None
     end = xp.maximum(xp.where(complete, last, next_eigenvalue), xp.finfo(at.dtype).tiny)
-    return tail, smallest, _moments(xp, exponents, terms, count, end * at, dimension)
+    return tail, smallest, _moments(exponents, terms, count, end * at, dimension)
 
 
 @numpy_where_known(most=_MANY, static_argnums=4)
-def _of_nodes(
-    xp: Any, resolution: Resolution, free: Any, at: Any, moments: list[Any], dimension: int
-) -> tuple[Any, ...]:
+def _of_nodes(resolution: Resolution, free: Any, at: Any, moments: list[Any], dimension: int) -> tuple[Any, ...]:
     """Return `resolution_bias`, `lasting_bias`, `coarse_fraction` and `smallest_resolved` of `Truncation`."""
+    xp = library_of(at)
     nodal: tuple[Any, ...] = (resolution.dispersion, resolution.of_eigenvalues, resolution.turning)
     if xp is np:  # The sizes of a compiled program cannot depend on the mask.
         nodal, free = tuple(x[free] for x in nodal), free[free]
     else:
         nodal, free = tuple(xp.where(free, x, 0).ravel() for x in nodal), free.ravel()
-    bias, lasting = _resolution_bias(xp, resolution, nodal, free, at, moments, dimension)
+    bias, lasting = _resolution_bias(resolution, nodal, free, at, moments, dimension)
     coarse = xp.sum(bias > BIAS_LIMIT, axis=1, dtype=at.dtype) / xp.sum(free, dtype=at.dtype)
-    early, _ = _resolution_bias(xp, resolution, nodal, free, at[:1], [xp.ones((1,), at.dtype)] * 3, dimension)
-    share = median_of_shares(xp, early, free)[0]
+    early, _ = _resolution_bias(resolution, nodal, free, at[:1], [xp.ones((1,), at.dtype)] * 3, dimension)
+    share = median_of_shares(early, free)[0]
     resolved = at[0] * (_odds(share) / _odds(BIAS_LIMIT)) ** (1 / resolution.order)
-    medians = (median_of_shares(xp, each, free) for each in (bias, lasting))
+    medians = (median_of_shares(each, free) for each in (bias, lasting))
     return *medians, coarse, resolved
 
 
@@ -199,11 +199,12 @@ def _of_nodes(
 # `beyond`. For the exponent a = d/2 of Weyl's law, the moments Σ (λt)ʲ e^(−λt)/Z are a (a + 1) … (a + j − 1) at small
 # t. With x = Λt, the integrals Sⱼ of y^(a+j−1) e^(−y) over y > x, times N(Λ) a x^(−a), satisfy the recurrence
 # Sⱼ₊₁ = (a + j) Sⱼ + N(Λ) a xʲ e^(−x), by parts.
-def _moments(xp: Any, exponents: Any, terms: Any, count: Any, x: Any, dimension: int) -> list[Any]:
+def _moments(exponents: Any, terms: Any, count: Any, x: Any, dimension: int) -> list[Any]:
     """Return three moments of λt in the heat trace, each relative to its value at small t."""
+    xp = library_of(exponents)
     a = dimension / 2
     x = xp.maximum(x, 1e-3)  # prevents overflow
-    left = beyond_by_weyl(xp, count, dimension, x)
+    left = beyond_by_weyl(count, dimension, x)
     trace = xp.sum(terms, axis=1) + left
     moments, scale = [], 1.0
     for j in range(3):
@@ -227,12 +228,13 @@ def _moments(xp: Any, exponents: Any, terms: Any, count: Any, x: Any, dimension:
 #
 #     c = (2/d)(d − 1) a(t|ξ|²),    a(x) = ∫₀¹ (1 + x (1 − s)²) exp(−x s (1 − s)) ds − 1 ≤ a(5.54) = 0.32.
 def _resolution_bias(
-    xp: Any, resolution: Resolution, nodal: tuple[Any, ...], free: Any, times: Any, moments: list[Any], d: int
+    resolution: Resolution, nodal: tuple[Any, ...], free: Any, times: Any, moments: list[Any], d: int
 ) -> tuple[Any, Any]:
     """Return the estimated relative discretisation error (times, nodes), and its part that does not decrease with t.
 
     The arrays of ``nodal`` are the dispersion, the part of the eigenvalues and the turning (nodes,), 0 at fixed nodes.
     """
+    xp = library_of(times)
     first, second, third = (each[:, None] for each in moments)
     order, t = resolution.order, times[:, None]
     dispersion, of_eigenvalues, turning = (x[None] for x in nodal)
@@ -257,11 +259,12 @@ def _odds(share: Any) -> Any:
     return share / (1 - share)
 
 
-def median_of_shares(xp: Any, x: Any, free: Any) -> Any:
+def median_of_shares(x: Any, free: Any) -> Any:
     """Return the median over the free nodes of each row of x (n, nodes), whose entries are in [0, 1], and 0 elsewhere.
 
     The accuracy is 1e-12. The median of a row with a NaN is NaN. In JAX, bisection is ten times as fast as sorting.
     """
+    xp = library_of(x)
     if xp is np:
         known = x[:, free.ravel()]
         middle = (known.shape[1] - 1) // 2
@@ -331,8 +334,9 @@ def beyond(count: Float[Array, "..."], exponent: Float[Array, "..."], x: Float[A
 
 
 # The integral over u in `beyond` is 1 for a = 1 and, by parts, 1 + (√π/2) erfc(√x) e^x/√x for a = 3/2.
-def beyond_by_weyl(xp: Any, count: Any, dimension: int, x: Any) -> Any:
+def beyond_by_weyl(count: Any, dimension: int, x: Any) -> Any:
     """Return `beyond` for Weyl's exponent d/2, where d is 2 or 3."""
+    xp = library_of(x)
     if dimension == 2:
         return count * xp.exp(-x) / x
     complement = erfc if xp is jnp else scipy.special.erfc
@@ -344,8 +348,9 @@ def resolving(share: float, dimension: int) -> float:
     return float(scipy.special.gammainccinv(dimension / 2, share))
 
 
-def _exponent(xp: Any, mean: Any) -> Any:
+def _exponent(mean: Any) -> Any:
     """Return the exponent a of the law N(λ) = N(Λ) (λ/Λ)^a, given the mean a/(a + 1) of λ/Λ over the λ below Λ."""
+    xp = library_of(mean)
     return xp.clip(mean / xp.maximum(1 - mean, 1e-3), float(_EXPONENTS[0]), float(_EXPONENTS[-1]))
 
 
@@ -398,7 +403,7 @@ def _map(pairs: Eigenpairs, at: Float[Array, " n"]) -> Float[Array, "n *shape"]:
     # The derivative of exp(−λt) with respect to t at 0 is −λ.
     moment = -spectral_diagonal(pairs, Derivative(Heat(at_zero), Heat(jnp.ones(1, dtype))))[0]
     mean = moment / jnp.where(count > 0, count * following, 1)
-    exponent = jnp.maximum(_exponent(jnp, mean), (pairs.space.dimension or 1) / 2)
+    exponent = jnp.maximum(_exponent(mean), (pairs.space.dimension or 1) / 2)
     left = beyond(count, exponent, following * at.reshape(-1, *axes))
     kept = spectral_diagonal(pairs, Heat(at))
     share = left / jnp.where(count > 0, left + kept, 1)

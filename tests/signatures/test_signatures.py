@@ -170,7 +170,7 @@ def incomplete_gamma(a, x):
 @pytest.mark.parametrize("d", [2, 3])
 def test_the_tail_by_weyl_in_closed_form(d, xp):
     x = np.geomspace(1e-3, 60, 40)
-    tail = beyond_by_weyl(xp, xp.asarray(7.0), d, xp.asarray(x))
+    tail = beyond_by_weyl(xp.asarray(7.0), d, xp.asarray(x))
     np.testing.assert_allclose(tail, incomplete_gamma(d / 2, x), rtol=1e-12)
 
 
@@ -231,11 +231,11 @@ def test_medians_are_those_of_sorting(rng, dtype, xp):
     free = np.arange(60) % 3 != 1  # 40 of 60; the others count as zero
     padded = np.zeros((5, 60), dtype)
     padded[:, free] = shares[:, :40]
-    found = median_of_shares(xp, xp.asarray(padded), free)
+    found = median_of_shares(xp.asarray(padded), free)
     # Of an even number, the lower of the two in the middle.
     np.testing.assert_allclose(found, np.sort(shares[:, :40], axis=1)[:, 19], rtol=3e-7, atol=1e-12)
     padded[1, 5] = np.nan
-    np.testing.assert_array_equal(np.isnan(median_of_shares(xp, xp.asarray(padded), free)), np.arange(5) == 1)
+    np.testing.assert_array_equal(np.isnan(median_of_shares(xp.asarray(padded), free)), np.arange(5) == 1)
 
 
 @pytest.mark.slow

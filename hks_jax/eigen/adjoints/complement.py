@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from hks_jax.arrays import library_of
 from hks_jax.checks import require_number
 from hks_jax.linear.operators import OfColumns
 from hks_jax.linear.products import even_size, inner_products, matmul, products_with_columns, row_blocks
@@ -122,7 +123,7 @@ def wanted_errors(before: OfRows, after: OfRows, amplified: OfRows, tolerance: f
         tolerance: the wanted relative error for the largest right-hand side.
         dtype: the dtype to which eigenvectors and rows were rounded.
     """
-    xp, largest = amplified.__array_namespace__(), before.max()
+    xp, largest = library_of(amplified), before.max()
     share = after / xp.where(largest > 0, largest, 1) * amplified
     noise = (after <= attainable(0, dtype) * before) | (share <= tolerance)
     return xp.where(noise, xp.inf, xp.minimum(tolerance / xp.where(noise, 1, share), 0.1))
@@ -130,7 +131,7 @@ def wanted_errors(before: OfRows, after: OfRows, amplified: OfRows, tolerance: f
 
 def norms(rows: Rows, lumped: Float[Array, " n_dof"]) -> OfRows:
     """Return √(rᵢᵀD⁻¹rᵢ) for each row rᵢ, where D is the lumped mass."""
-    xp = rows.__array_namespace__()
+    xp = library_of(rows)
     return xp.sqrt(xp.sum(rows * rows / lumped[None], axis=1))
 
 
@@ -156,7 +157,7 @@ def group_numbers(
 def shifts_between(values: Values, nearest: Shifts, farthest: Shifts) -> Shifts:
     """Return each group's shift: the midpoint of the computed gap whose distance from `first_beyond` is nearest to
     √(``nearest`` · ``farthest``), or a negative number if all eigenvalues are equal."""
-    xp = values.__array_namespace__()
+    xp = library_of(values)
     targets, below = first_beyond(values) - xp.sqrt(nearest * farthest), -0.1 * values[-1]
     if values.size == 1:
         return xp.broadcast_to(below, targets.shape)

@@ -233,7 +233,7 @@ def _ordered(values: np.ndarray, vectors: np.ndarray, complete_below: float) -> 
 
 def _rounding(K: csc_matrix, M: csc_matrix) -> float:
     """Return the distance at which two eigenvalues are equal within rounding."""
-    return 4 * np.finfo(float).eps * float(largest_of(np, K, M))
+    return 4 * np.finfo(float).eps * float(largest_of(K, M))
 
 
 def _lower_bound(K: csc_matrix, M: csc_matrix) -> float:
