@@ -95,11 +95,11 @@ def numpy_where_known(most: int = _FEW, **settings: Any) -> Callable[[Callable[.
     decide between NumPy and XLA, so that repeated computations on concrete arrays round equally.
     """
 
-    def decorate(function: Callable[P, T]) -> Callable[P, T]:
+    def decorate(function: Callable[..., T]) -> Callable[..., T]:
         compiled = jit_quickly(**settings)(function)
 
         @wraps(function)
-        def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        def call(*args: Any) -> T:
             is_small = sum(np.size(leaf) for leaf in jax.tree.leaves(args)) <= most
             return by_numpy(function, *args) if is_small and is_concrete_on_cpu(args) else compiled(*args)
 

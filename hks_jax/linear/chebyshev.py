@@ -83,7 +83,7 @@ def chebyshev_iteration(
     together = 2 if accelerators.at_hand() else 1
     missing = jnp.asarray((degree - 1) % together)
 
-    def turn(_: Array, state: Step) -> Step:
+    def turn(number: Array, state: Step) -> Step:
         for _ in range(together):
             state = step(state)
         return state
