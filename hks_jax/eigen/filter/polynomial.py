@@ -74,29 +74,27 @@ def correction(
     ``whole`` is not zero, the corresponding column of ``residual`` must be Kx, and D⁻¹Kx − ζx replaces D⁻¹r, so that x
     plus the result is the filtered vector p(D⁻¹K)x / p(ζ).
     """
-    dtype = residual.dtype
+    dtype, reference = residual.dtype, jnp.minimum(value, band.low)
 
     def scaled(matrix: Stencil) -> Callable[[Columns], Columns]:
         return replace(matrix, coefficients=(matrix.coefficients / pencil.lumped[None]).astype(dtype)).of_columns()
 
     stiffness = scaled(pencil.stiffness)
 
-    def series() -> Columns:
-        mass = scaled(pencil.mass)
-        return run(lambda y: jax.lax.fori_loop(0, terms, lambda _, sum_: y + (sum_ - mass(sum_)), y))
-
-    reference = jnp.minimum(value, band.low)
-
-    def run(inverse: Callable[[Array], Array]) -> Columns:
+    def run(inverse: Callable[[Columns], Columns]) -> Columns:
         w = inverse(residual / pencil.lumped[..., None].astype(dtype))
         w = w - aligned(reference.astype(dtype), residual) * whole
         return chebyshev_iteration(lambda z: inverse(stiffness(z)), w, band.low, band.high, reference, degree)
 
-    def plain() -> Columns:
+    def by_lumping() -> Columns:
         return run(lambda y: y)
 
-    # The case ``terms`` = 0 is compiled separately, so that XLA fuses a whole step of the Chebyshev iteration.
-    return plain() if pencil.mass.is_diagonal else jax.lax.cond(jnp.asarray(terms) > 0, series, plain)
+    def by_series() -> Columns:
+        mass = scaled(pencil.mass)
+        return run(lambda y: jax.lax.fori_loop(0, terms, lambda _, sum_: y + (sum_ - mass(sum_)), y))
+
+    # Lumping is compiled separately, so that XLA fuses a whole step of the Chebyshev iteration.
+    return by_lumping() if pencil.mass.is_diagonal else jax.lax.cond(jnp.asarray(terms) > 0, by_series, by_lumping)
 
 
 @jit_quickly()

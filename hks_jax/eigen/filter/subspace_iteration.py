@@ -41,7 +41,8 @@ _MARGIN = 1.1
 _SPLIT, _APART = 0.05, 1.5
 """The Neumann series of the inverse mass gets more terms until the relative errors 1 − ψ(λ)/λ of eigenvalues λ near the
 last wanted eigenvalue differ by at most ``_SPLIT``, and until ψ(λ) is at least ``_APART`` times the last wanted
-eigenvalue for all λ above twice that eigenvalue."""
+eigenvalue for all λ above twice that eigenvalue. In measurements, a smaller ``_SPLIT`` cost more than it saved, because
+the first term makes a filter 2.8 times as expensive."""
 _MOST_TERMS = 15
 """The maximal number of terms, after the first, of the Neumann series of the inverse mass."""
 
