@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hks_jax.arrays import ByKey, library_of
+from hks_jax.arrays import ByKey
 from hks_jax.compilation import numpy_where_known
 from hks_jax.domain.components import active_elements, bounding_box, element_nodes, label_nodes, rim_nodes, wrap_nodes
 from hks_jax.domain.grid import Grid
@@ -107,24 +107,24 @@ class FunctionSpace(ByKey):
 
 @numpy_where_known(most=_COPIED, static_argnums=1)
 def _reshaped(values: Any, shape: tuple[int, ...]) -> Any:
-    return library_of(values).reshape(values, shape)
+    return values.reshape(shape)
 
 
 # The indices are arguments, so that index arrays of equal length share one compilation.
 @numpy_where_known(most=_COPIED)
 def taken(values: Any, indices: Any) -> Any:
     """Return the values (…, m) at given indices of the last axis."""
-    return library_of(values).take(values, indices, axis=-1, mode="clip")
+    return values.take(indices, axis=-1, mode="clip")
 
 
 @numpy_where_known(most=_COPIED)
 def _spread(values: Any, indices: Any, fill: Any) -> Any:
-    xp = library_of(values)
-    full = xp.tile(fill, (*values.shape[:-1], 1))
-    if xp is jnp:
-        return full.at[..., indices].set(values, unique_indices=True, indices_are_sorted=True)
-    full[..., indices] = values
-    return full
+    leading = (*values.shape[:-1], 1)
+    if isinstance(values, np.ndarray):
+        full = np.tile(fill, leading)
+        full[..., indices] = values
+        return full
+    return jnp.tile(fill, leading).at[..., indices].set(values, unique_indices=True, indices_are_sorted=True)
 
 
 @jax.tree_util.register_static
