@@ -2,6 +2,8 @@
 
     python benchmarks/eigensolvers/volumes.py [--cases 32/200 ...] [--solvers NAME ...] [--limit SECONDS] [-o FILE]
 
+The file filter.json is that of ``--solvers chebyshev-filter`` with the cases 32/200 to 128/200.
+
 Every measurement is a process of its own, so that its peak memory is its own too; one that takes longer than the limit,
 or more memory than there is, is reported as such. Timed is the eigensolver alone, from assembled matrices to
 eigenpairs, compilation apart (the second call, where the first takes under four minutes). The peak of memory is that of
