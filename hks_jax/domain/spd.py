@@ -18,7 +18,7 @@ from hks_jax.linear.products import matmul
 @numpy_where_known()
 def symmetrise(tensors: Any) -> Any:
     """Return the symmetric part, ``(T + Tᵀ)/2``."""
-    return 0.5 * (tensors + library_of(tensors).swapaxes(tensors, -1, -2))
+    return 0.5 * (tensors + tensors.mT)
 
 
 def identity_outside(

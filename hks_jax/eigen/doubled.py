@@ -138,7 +138,7 @@ class DoubledEigenpairs(Eigenpairs, eqx.Module):
 @numpy_where_known(static_argnums=(1, 2))
 def _order(spectra: Any, including: Inclusions, k: int) -> Any:
     """Return the places (…, k) of the k lowest eigenvalues in the concatenated spectra of all problems."""
-    xp = library_of(spectra[0])
+    xp = library_of(*spectra)
     keys: list[Any] = []
     for own, others in zip(spectra, including, strict=True):
         for key in (keys[j] for j in others[:-1]):
@@ -160,7 +160,7 @@ def _in_order(values: Any, order: Any, axis: int) -> Any:
 
 @numpy_where_known(static_argnums=1)
 def _over(values: Any, name: str) -> Any:
-    xp = library_of(values[0])
+    xp = library_of(*values)
     return getattr(xp, name)(xp.stack(values), axis=0)
 
 

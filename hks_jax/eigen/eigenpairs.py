@@ -401,5 +401,5 @@ def _uncertain(kept: Any, rounding: Any, values: Any) -> Any:
 
 @numpy_where_known()
 def _all_finite(arrays: list[Any]) -> Any:
-    xp = library_of(arrays[0])
+    xp = library_of(*arrays)
     return xp.all(xp.stack([xp.all(xp.isfinite(array)) for array in arrays]))
