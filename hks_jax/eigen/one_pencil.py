@@ -12,7 +12,15 @@ from hks_jax.arrays import jax_array, library_of
 from hks_jax.compilation import is_concrete_on_cpu, numpy_where_known
 from hks_jax.eigen.derivative import solved
 from hks_jax.eigen.eigenpairs import UNCERTAIN, PencilEigenpairs
-from hks_jax.eigen.quality import allowed_residuals, indistinct, largest, largest_of, measure_pairs, measured_on_host
+from hks_jax.eigen.quality import (
+    allowed_residuals,
+    indistinct,
+    largest,
+    largest_of,
+    measure_pairs,
+    measured_on_host,
+    rounding_of_quotients,
+)
 from hks_jax.eigen.solver import Dense, Eigensolver, Report
 from hks_jax.fem.box import cropped, in_box
 from hks_jax.fem.pencil import Pencil
@@ -145,7 +153,9 @@ def _near_zero(
         return nothing, nothing if null_space_known else jnp.where(zero, indistinct(pencil, values.dtype), 0)
     near = np.abs(np.asarray(values)) <= float(indistinct(pencil, values.dtype)) / UNCERTAIN
     where = np.flatnonzero(near & (np.arange(values.size) >= pencil.n_null))
-    if where.size:
+    if where.size and null_space_known and not accurate:
+        rounding[where] = rounding_of_quotients(pencil, vectors, where)
+    elif where.size:
         quotients, changes, _ = near_zero(pencil, np.asarray(vectors)[where], accurate)
         # Rounding of the vectors to float32 changes quotients by its square.
         exact = np.abs(quotients) <= np.finfo(np.float32).eps ** 2 * float(largest(pencil))

@@ -5,12 +5,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.arrays import library_of
 from hks_jax.compilation import numpy_where_known
-from hks_jax.linear.products import products_with_columns, row_blocks
-from hks_jax.linear.symmetric_pencil import SymmetricPencil
+from hks_jax.linear.products import of_each_column, products_with_columns, row_blocks
+from hks_jax.linear.symmetric_pencil import SymmetricPencil, change_by_rounding
 
 _EXCUSED = 0.01
 """The largest relative residual that is accepted as rounding."""
@@ -37,7 +37,7 @@ def measure_pairs(
         columns = jax.lax.optimization_barrier(jax.lax.dynamic_slice_in_dim(vectors, start, size).T)
         force, image = stiffness(columns), mass(columns)
         if values is None:
-            quotients = jnp.sum(columns * force, axis=0) / jnp.sum(columns * image, axis=0)
+            quotients = of_each_column(columns, force) / of_each_column(columns, image)
         else:
             quotients = jax.lax.dynamic_slice_in_dim(values, start, size)
         twice = jnp.zeros(size, bool)
@@ -46,10 +46,29 @@ def measure_pairs(
             products = products_with_columns(jax.lax.dynamic_slice_in_dim(vectors, first, width), image)
             before = first + jnp.arange(width)[:, None] < start + jnp.arange(size)[None]
             twice = jnp.any(before & (jnp.abs(products) > _ALIKE), axis=0)
-        residuals = jnp.linalg.norm(force - quotients[None] * image, axis=0) / jnp.linalg.norm(image, axis=0)
-        return quotients, residuals, twice
+        residual = force - quotients[None] * image
+        return quotients, jnp.sqrt(of_each_column(residual, residual) / of_each_column(image, image)), twice
 
     return jax.tree.map(lambda of_blocks: of_blocks[place], jax.lax.map(measure, jnp.asarray(starts)))
+
+
+@jax.jit
+def rounding_of_quotients(
+    pencil: SymmetricPencil, vectors: Float[Array, "m n_dof"], chosen: Int[Array, " c"]
+) -> Float[Array, " c"]:
+    """Bound the changes of the Rayleigh quotients of the chosen vectors by rounding of K; see `change_by_rounding`."""
+    sizes, mass = pencil.stiffness.with_flat(jnp.abs(pencil.stiffness.flat())).of_columns(), pencil.mass.of_columns()
+    weights = 2 * sizes(jnp.ones((vectors.shape[1], 1), vectors.dtype))[:, 0]
+
+    starts, place = row_blocks(len(chosen), min(_ROWS, len(chosen)))
+
+    def bounds(start: Array) -> Float[Array, " b"]:
+        numbers = jax.lax.dynamic_slice_in_dim(chosen, start, min(_ROWS, len(chosen)))
+        columns = jax.lax.optimization_barrier(vectors[numbers].T)
+        changes = change_by_rounding(sizes(columns), weights, columns)
+        return jnp.finfo(vectors.dtype).eps * changes / of_each_column(columns, mass(columns))
+
+    return jax.lax.map(bounds, jnp.asarray(starts))[place]
 
 
 def measured_on_host(

@@ -12,7 +12,7 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from hks_jax.linear.multifrontal import CONTRACTION
 from hks_jax.linear.operators import Places
-from hks_jax.linear.symmetric_pencil import SymmetricPencil
+from hks_jax.linear.symmetric_pencil import SymmetricPencil, change_by_rounding
 
 _EXACT = 1e-13
 """The sum of a row of K, relative to the sizes of the entries, up to which the sum is zero in double precision."""
@@ -119,17 +119,12 @@ def near_zero(
     source, columns = pencil.unrounded, vectors.T.astype(np.float64)
     data, matrices = host_matrices(pencil)
     K, M = matrices(data[0], 0.0, *data[2:])
-    # If all entries Kᵢⱼ are rounded and wᵢ are the sums of rows, the changes of Kᵢⱼ and wᵢ change the quadratic form
-    #
-    #     φᵀKφ = −Σ_{i<j} Kᵢⱼ (φᵢ − φⱼ)² + Σᵢ wᵢφᵢ².
-    #
-    # A sum wᵢ that is known to be zero, because K annihilates constants, does not change.
     sizes, sums = abs(K), K @ np.ones(pencil.size)
     limits = sizes @ np.ones(pencil.size)
     exact = np.abs(sums) <= _EXACT * limits if accurate else np.zeros(pencil.size, bool)
-    changes = np.where(exact, limits, 2 * limits) @ columns**2 - np.sum(columns * (sizes @ columns), axis=0)
     force, image = K @ columns, M @ columns
     squares = np.sum(columns * image, axis=0)
+    changes = change_by_rounding(sizes @ columns, np.where(exact, limits, 2 * limits), columns)
     rounding = np.finfo(source.stiffness.dtype).eps * changes / squares
     quotients = np.sum(columns * force, axis=0) / squares
     residuals = np.linalg.norm(force - quotients * image, axis=0) / np.linalg.norm(image, axis=0)

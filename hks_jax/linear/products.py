@@ -87,6 +87,15 @@ def gram(x: Float[Array, "n b"], y: Float[Array, "n c"]) -> Float[Array, "b c"]:
     return matmul(x.T, y)
 
 
+def of_each_column(x: Any, y: Any) -> Any:
+    """Return the inner product of each column of x with the same column of y, for arrays (n, b) of JAX or NumPy.
+
+    If x is a product with a stencil, XLA's CPU compiler would fuse a sum of entries with half of the stencil's terms,
+    and store the others: three times the memory and four times the time. It does not fuse a matrix product.
+    """
+    return matmul(x.T, y).diagonal()
+
+
 def even_size(count: int, most: int) -> int:
     """Return the block size for dividing ``count`` items into the fewest blocks of equal size, at most ``most``."""
     return -(-count // -(-count // most))

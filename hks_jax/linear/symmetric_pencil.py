@@ -1,6 +1,6 @@
 """Symmetric definite pencils (K, M), the input of eigensolvers."""
 
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from hks_jax.linear.operators import Operator, PatternedOperator, SparseOperator, shifted
 from hks_jax.linear.pattern import Pattern, SparsePattern
+from hks_jax.linear.products import of_each_column
 
 
 class NullSpace(eqx.Module):
@@ -91,6 +92,20 @@ class SymmetricPencil(eqx.Module):
     def shifted(self, shift: Float[Array, ""]) -> Float[Array, " m"]:
         """Return the entries of K − σM at the places of K's pattern."""
         return shifted(self.stiffness, self.mass, shift)
+
+
+# If all entries Kᵢⱼ are rounded and wᵢ are the sums of rows, the changes of Kᵢⱼ and wᵢ change the quadratic form
+#
+#     φᵀKφ = −Σ_{i<j} Kᵢⱼ (φᵢ − φⱼ)² + Σᵢ wᵢφᵢ².
+#
+# With the sums Sᵢ = Σⱼ |Kᵢⱼ|, relative changes up to ε change the first term by at most ε(Σᵢ Sᵢφᵢ² − φᵀ|K|φ), and the
+# second by at most ε Σᵢ Sᵢφᵢ². A sum wᵢ that is known to be zero, because K annihilates constants, does not change.
+def change_by_rounding(image: Any, weights: Any, columns: Any) -> Any:
+    """Return a bound of the change of φᵀKφ by rounding, divided by ε, for each column φ.
+
+    ``image`` is |K|φ. ``weights`` are 2Sᵢ, or Sᵢ at nodes i where the sum of the row is known to be zero.
+    """
+    return of_each_column(columns, weights[:, None] * columns - image)
 
 
 P = TypeVar("P", bound=SymmetricPencil)

@@ -14,8 +14,10 @@ from hks_jax.eigen.filter import chebyshev_filter
 from hks_jax.eigen.filter.coarsening import coarsen, interpolate
 from hks_jax.eigen.filter.polynomial import MOST_DEGREE, Band, correction, upper_end
 from hks_jax.eigen.filter.subspace_iteration import GridFilter
+from hks_jax.eigen.quality import rounding_of_quotients
 from hks_jax.fem.box import cropped
 from hks_jax.fem.nodal import nodal_pencil, to_columns, to_rows
+from hks_jax.linear.host_matrices import near_zero
 
 
 def masked(shape):
@@ -256,6 +258,26 @@ def test_multiplicities_of_a_cube_are_complete():
     line = 6 * (n - 1) ** 2 * (1 - np.cos(angles)) / (2 + np.cos(angles))
     expected = np.sort((line[:, None, None] + line[:, None] + line).ravel())[:k]
     np.testing.assert_allclose(pairs.eigenvalues, expected, atol=1e-10 * expected[-1])
+
+
+def test_single_precision_where_a_coarse_grid_has_fewer_low_modes_than_vectors():
+    # The random start on 8³ nodes leaves 32 vectors so dependent that rounding makes their Gram matrix indefinite.
+    field, k, told = flat((16, 16, 16), (1.0, 1.1, 1.23)), 10, []
+    single = hj.TensorField(field.grid, np.float32(field.tensors))
+    pairs = hj.eigenpairs(single, k, solver=hj.ChebyshevFilter(tolerance=1e-4), progress=told.append)
+    assert told[0] == "grid 8 × 8 × 8"
+    assert pairs.converged.all()
+    exact = hj.eigenpairs(field, k, solver="shift-invert").eigenvalues
+    np.testing.assert_allclose(pairs.eigenvalues, exact, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_rounding_of_quotients_is_what_the_host_computes_in_double_precision():
+    pencil = problem("mixed, mask", np.float32)
+    pairs = hj.eigenpairs(pencil, 12)
+    chosen = np.arange(1, 12)
+    _, changes, _ = near_zero(pencil, np.asarray(pairs.vectors)[chosen], accurate=False)
+    np.testing.assert_allclose(rounding_of_quotients(pencil, pairs.vectors, chosen), changes, rtol=1e-5)
 
 
 @pytest.mark.slow

@@ -181,7 +181,7 @@ def _converge(grid: GridFilter, rounding: Array, state: FilterState, max_rounds:
         return grid.excess(rounding, state)[:wanted]
 
     def going_on(state: FilterState) -> Bool[Array, ""]:
-        return jnp.any(~(excess(state) <= 1)) & (state.rounds < max_rounds)
+        return jnp.any(excess(state) > 1) & (state.rounds < max_rounds)  # NaN ends the iteration
 
     if report is silent or is_traced(state):
         return while_loop(going_on, partial(grid.improve, rounding), state)

@@ -17,7 +17,7 @@ from hks_jax.fem.nodal import NodalPencil, lump, to_columns, to_rows
 from hks_jax.fem.space import axis_colours
 from hks_jax.fem.stencil import Stencil
 
-_COLUMNS = 16
+_COLUMNS = 8
 
 
 @jit_quickly()

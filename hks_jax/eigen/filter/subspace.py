@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from hks_jax.fem.halo import Slabs
 from hks_jax.fem.nodal import NodalPencil, to_columns
+from hks_jax.linear import lapack
 from hks_jax.linear.accelerators import row_by_row
 from hks_jax.linear.dense_eigh import pencil_eigh
 from hks_jax.linear.loops import by_column_ranges
@@ -85,9 +86,19 @@ def rayleigh_ritz(pencil: NodalPencil, slabs: Slabs | None, block: int, x: Rows)
     both = jax.lax.map(among_rows, jnp.arange(m // block))
     both = both if slabs is None else slabs.total(both)
     stiffness, mass = (jnp.moveaxis(p, 0, 1).reshape(m, m) for p in both)
-    values, vectors = pencil_eigh((stiffness + stiffness.T) / 2, (mass + mass.T) / 2)
+    values, vectors = pencil_eigh((stiffness + stiffness.T) / 2, _positive((mass + mass.T) / 2))
     values, mix = (_of_first(slabs, found) for found in (values, vectors.T))
     return values, by_column_ranges(partial(matmul, mix), _CHUNK, x)
+
+
+# A filter leaves vectors almost dependent if fewer modes than vectors lie below its band, as on coarse grids. Rounding
+# then makes the Gram matrix indefinite. The shift is larger than the errors of its entries, and only directions that
+# rounding dominates change by it (shifted Cholesky QR, Fukaya et al. 2020); later rounds make them accurate.
+def _positive(gram: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    """Return a Gram matrix, with a larger diagonal if it is not positive definite after rounding."""
+    failed = ~jnp.all(jnp.isfinite(lapack.cholesky(gram)))
+    shift = 10 * len(gram) * jnp.finfo(gram.dtype).eps * jnp.diagonal(gram)
+    return gram + jnp.diag(jnp.where(failed, shift, 0))
 
 
 def measured(pencil: NodalPencil, slabs: Slabs | None, block: int, values: Values, x: Rows) -> tuple[Values, Values]:

@@ -300,8 +300,8 @@ def _change(pencil: NodalPencil, band: Band, terms: Number, block: Block) -> Col
 def _lumping(plan: FilterPlan, state: FilterState) -> tuple[Number, Values, Values]:
     """Return the fields ``terms``, ``values`` and ``factor`` of `Filtering`."""
     values, wanted = state.values, state.values[plan.wanted - 1]
-    # The lumped mass decreases the eigenvalue of each mode by a relative amount, 1 − β.
-    missing = 1 - jnp.where(values > 0, state.lumped_values / jnp.where(values > 0, values, 1), 1)
+    # The lumped mass decreases the eigenvalue of each mode by a relative amount, 1 − β. Rounding may violate 0 ≤ β ≤ 1.
+    missing = jnp.clip(1 - jnp.where(values > 0, state.lumped_values / jnp.where(values > 0, values, 1), 1), 0, 1)
     powers = jnp.arange(1, _MOST_TERMS + 2, dtype=values.dtype)[:, None]
     lost = missing[None] ** powers
     near = (values >= wanted / 2) & (values <= 2 * wanted)
