@@ -368,6 +368,17 @@ def test_intervals_contain_the_truth_as_often_as_they_say(rng):
         np.testing.assert_allclose(np.mean(found, axis=(0, 2)), level, atol=0.06)
 
 
+def test_seeds_in_a_batch_give_the_draws_of_each(rng):
+    D = jnp.asarray(random_spd(rng, (5, 6), 0.3))
+    noise = hj.TensorNoise.relative(D, 0.05)
+
+    def deviation(seed):
+        return hj.uncertainty(lambda D: D[..., 0, 0] ** 2, D, noise, method="resample", draws=8, seed=seed).deviation
+
+    together = jax.vmap(deviation)(jnp.arange(3))
+    np.testing.assert_allclose(together, [deviation(seed) for seed in range(3)], rtol=1e-12)
+
+
 def test_what_is_beyond_linear_or_indefinite_is_said(rng):
     D = random_spd(rng, (30, 30), 0.1)
     bars = quietly(spd.inverse, D, hj.TensorNoise.relative(D, 0.15), draws=8)
