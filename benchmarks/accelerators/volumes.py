@@ -157,6 +157,25 @@ def on_cpu(n: int, k: int) -> dict:
     return row | worst | {"converged": int(pairs.converged.sum()), "peak_GB": peak_GB()}
 
 
+def accuracy(n: int, k: int, found: list[float]) -> dict:
+    """Return the row of the errors of eigenvalues of the random field, against double precision on coarser grids.
+
+    The errors of the finite elements are a₂h² + a₄h⁴ + …, so that three grids determine the eigenvalues on n³ nodes.
+    """
+    values, sides = [], (48, 64, 80)
+    for side in sides:
+        tensors = np.asarray(random_field(side))
+        with jax.enable_x64(True):
+            field = hj.TensorField(grid(side), tensors.astype(float))
+            values.append(np.asarray(hj.eigenpairs(field, k, solver="chebyshev-filter").eigenvalues))
+
+    def powers(sides: Any) -> np.ndarray:
+        return (1 / (np.asarray(sides, float)[:, None] - 1)) ** np.array([0, 2, 4])
+
+    expected = (powers([n]) @ np.linalg.solve(powers(sides), np.array(values)))[0]
+    return {"largest_error": float(np.max(np.abs(np.array(found)[1:] / expected[1:] - 1)))}
+
+
 def gradient(n: int, k: int) -> dict:
     """Return the row of the gradient of a loss.
 
@@ -272,6 +291,7 @@ def main() -> None:
     if single:
         n, k = map(int, single.split("/"))
         attempt("eigenpairs", n, k, partial(on_cpu, n, k))
+        attempt("accuracy", n, k, lambda: accuracy(n, k, rows[-1]["eigenvalues"]))
         return
     for n, k in cases:
         expected, done = 0.0, [row for row in rows if "first_call_s" in row and row["what"] == "eigenpairs"]
