@@ -106,18 +106,26 @@ def peak_GB() -> float:
     return known["peak_bytes_in_use"] / 1e9 if "peak_bytes_in_use" in known else peak_memory()
 
 
+def solve(
+    n: int, k: int, metric: Callable[[int], jax.Array], solver: Any = "chebyshev-filter", show: Any = lambda text: None
+) -> tuple[float, float, hj.Eigenpairs, int]:
+    """Return the seconds of assembly and eigenpairs, the eigenpairs, and the rounds on the finest grid."""
+    told: list[str] = []
+
+    def tell(text: str) -> None:
+        told.append(text)
+        show(text)
+
+    of_assembly, pencil = timed_once(assembled, n, metric(n))
+    return of_assembly, *timed_once(partial(hj.eigenpairs, pencil, k, solver=solver, progress=tell)), rounds_of(told)
+
+
 def measure(n: int, k: int) -> dict:
     """Return the row of a case."""
     times = np.geomspace(4, 400, 8) / closed_form(n, k)[0][-1]
     row: dict[str, Any] = {}
 
-    def solve(tensors: jax.Array) -> tuple[float, float, hj.Eigenpairs, int]:
-        told: list[str] = []
-        of_assembly, pencil = timed_once(assembled, n, tensors)
-        run = partial(hj.eigenpairs, pencil, k, solver="chebyshev-filter", progress=told.append)
-        return of_assembly, *timed_once(run), rounds_of(told)
-
-    _, row["first_call_s"], pairs, row["box_rounds"] = solve(box(n))
+    _, row["first_call_s"], pairs, row["box_rounds"] = solve(n, k, box)
     discrete, smooth, _ = closed_form(n, k)
     values = np.asarray(pairs.eigenvalues, float)
     for name, exact in (("box_error", discrete), ("box_smooth_error", smooth)):
@@ -127,7 +135,7 @@ def measure(n: int, k: int) -> dict:
     known = box_signature(n, k, times, nodes)
     row["signature_error"] = float(np.max(np.abs(np.asarray(signature)[:, *nodes.T] / known - 1)))
     del pairs, signature
-    row["assembly_s"], row["seconds"], pairs, row["rounds"] = solve(random_field(n))
+    row["assembly_s"], row["seconds"], pairs, row["rounds"] = solve(n, k, random_field)
     row["signature_s"], _ = timed_once(hj.hks, pairs, times)
     row["converged"] = int(pairs.converged.sum())
     row["residuals_s"], residuals = timed_once(relative_residuals, pairs.pencil, pairs.eigenvalues, pairs.vectors)
@@ -139,26 +147,19 @@ def on_cpu(n: int, k: int) -> dict:
 
     The time of the eigenpairs includes the compilation. The residuals are those of the result, in single precision.
     """
-    tensors = random_field(n)
-    of_assembly, pencil = timed_once(assembled, n, tensors)
-    del tensors
-    told: list[str] = []
-
-    def tell(text: str) -> None:
-        told.append(text)
-        print(text, flush=True)
-
     solver = hj.ChebyshevFilter(tolerance=1e-4, block=8)
-    seconds, pairs = timed_once(partial(hj.eigenpairs, pencil, k, solver=solver, progress=tell))
+    of_assembly, seconds, pairs, rounds = solve(n, k, random_field, solver, partial(print, flush=True))
     values = np.asarray(pairs.eigenvalues, float)
-    row = {"assembly_s": of_assembly, "seconds": seconds, "rounds": rounds_of(told), "eigenvalues": values.tolist()}
+    row = {"assembly_s": of_assembly, "seconds": seconds, "rounds": rounds, "eigenvalues": values.tolist()}
     row["signature_s"], _ = timed_once(hj.hks, pairs, np.geomspace(4, 400, 8) / values[-1])
     worst = {"worst_residual": float(pairs.residuals.max()), "largest_rounding": float(pairs.rounding.max())}
-    return row | worst | {"converged": int(pairs.converged.sum()), "peak_GB": peak_GB()}
+    row |= worst | {"converged": int(pairs.converged.sum()), "peak_GB": peak_GB()}
+    del pairs
+    return row | {"largest_error": error_of(values, n, k)}
 
 
-def accuracy(n: int, k: int, found: list[float]) -> dict:
-    """Return the row of the errors of eigenvalues of the random field, against double precision on coarser grids.
+def error_of(found: np.ndarray, n: int, k: int) -> float:
+    """Return the largest relative error of eigenvalues of the random field, against double precision on coarser grids.
 
     The errors of the finite elements are a₂h² + a₄h⁴ + …, so that three grids determine the eigenvalues on n³ nodes.
     """
@@ -173,7 +174,7 @@ def accuracy(n: int, k: int, found: list[float]) -> dict:
         return (1 / (np.asarray(sides, float)[:, None] - 1)) ** np.array([0, 2, 4])
 
     expected = (powers([n]) @ np.linalg.solve(powers(sides), np.array(values)))[0]
-    return {"largest_error": float(np.max(np.abs(np.array(found)[1:] / expected[1:] - 1)))}
+    return float(np.max(np.abs(found[1:] / expected[1:] - 1)))
 
 
 def gradient(n: int, k: int) -> dict:
@@ -291,7 +292,6 @@ def main() -> None:
     if single:
         n, k = map(int, single.split("/"))
         attempt("eigenpairs", n, k, partial(on_cpu, n, k))
-        attempt("accuracy", n, k, lambda: accuracy(n, k, rows[-1]["eigenvalues"]))
         return
     for n, k in cases:
         expected, done = 0.0, [row for row in rows if "first_call_s" in row and row["what"] == "eigenpairs"]

@@ -59,7 +59,6 @@ def rounding_of_quotients(
     """Bound the changes of the Rayleigh quotients of the chosen vectors by rounding of K; see `change_by_rounding`."""
     sizes, mass = pencil.stiffness.with_flat(jnp.abs(pencil.stiffness.flat())).of_columns(), pencil.mass.of_columns()
     weights = 2 * sizes(jnp.ones((vectors.shape[1], 1), vectors.dtype))[:, 0]
-
     starts, place = row_blocks(len(chosen), min(_ROWS, len(chosen)))
 
     def bounds(start: Array) -> Float[Array, " b"]:
