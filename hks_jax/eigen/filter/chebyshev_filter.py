@@ -26,6 +26,7 @@ from hks_jax.fem.nodal import NodalPencil, nodal_pencil
 from hks_jax.fem.pencil import Pencil, from_lower_bound
 from hks_jax.fem.space import GridSpace
 from hks_jax.fem.stencil import StencilOperator
+from hks_jax.linear import accelerators
 from hks_jax.linear.loops import while_loop
 from hks_jax.traced import is_traced
 
@@ -54,7 +55,8 @@ class ChebyshevFilter(Eigensolver[Pencil]):
 
     Attributes:
         tolerance: the relative residual at which a pair counts as converged.
-        block: the number of vectors filtered together. The size of the workspace is proportional to ``block``.
+        block: the number of vectors filtered together, to which the size of the workspace is proportional. None means 16
+            on CPUs, and 32 on accelerators, which then launch fewer kernels.
         max_rounds: the maximal number of rounds on the finest grid.
         mesh: the devices, as a `jax.sharding.Mesh` with one axis. Each device filters some of the vectors, and stores
             all vectors on a part of the grid (docs/devices.md). None means one device.
@@ -70,14 +72,14 @@ class ChebyshevFilter(Eigensolver[Pencil]):
     name: ClassVar[str] = "chebyshev-filter"
     starts: ClassVar[bool] = True
     tolerance: float = eqx.field(default=1e-8, static=True)
-    block: int = eqx.field(default=32, static=True)
+    block: int | None = eqx.field(default=None, static=True)
     max_rounds: int = eqx.field(default=60, static=True)
     adjoint: Adjoint = eqx.field(default=FilteredAdjoint(), static=True, kw_only=True)
     mesh: Mesh | None = eqx.field(default=None, static=True)
     keep_spare: bool = eqx.field(default=False, static=True)
 
     def __check_init__(self) -> None:
-        require_count("block", self.block)
+        require_count("block", self._together)
         require_count("max_rounds", self.max_rounds)
         if self.mesh is not None:
             checked_mesh(self.mesh)
@@ -116,14 +118,18 @@ class ChebyshevFilter(Eigensolver[Pencil]):
 
     def max_pairs(self, n_dof: int) -> int:
         """Return the largest k for which the filter still damps most of the spectrum."""
-        return max(n_dof // 8 - self.block, 0)
+        return max(n_dof // 8 - self._together, 0)
+
+    @property
+    def _together(self) -> int:
+        return (32 if accelerators.at_hand() else 16) if self.block is None else self.block
 
     def plan(self, k: int, space: GridSpace) -> FilterPlan:
         """Return the number of vectors, and the other static settings of the subspace iteration, for k eigenpairs."""
-        mesh = None if self.mesh is None else checked_mesh(self.mesh)
-        together = self.block if mesh is None else self.block * mesh.size
-        size = math.ceil((k + max(8, _SPARE * k)) / together) * together
-        return FilterPlan(k, size, self.block, space.n_null, self.tolerance, mesh)
+        mesh, block = None if self.mesh is None else checked_mesh(self.mesh), self._together
+        multiple = block if mesh is None else block * mesh.size
+        size = math.ceil((k + max(8, _SPARE * k)) / multiple) * multiple
+        return FilterPlan(k, size, block, space.n_null, self.tolerance, mesh)
 
 
 def _iterate(
