@@ -52,11 +52,6 @@ def jax_array(value: Any) -> Array:
     return jax.device_put(value) if isinstance(value, np.ndarray) and not is_staged() else jnp.asarray(value)
 
 
-def library_of(*arrays: Any) -> Any:
-    """Return `numpy` if all arrays are NumPy's, and otherwise `jax.numpy`: the library that computes with them."""
-    return np if all(isinstance(array, np.ndarray | np.generic) for array in arrays) else jnp
-
-
 def describe_array(value: Any) -> str:
     """Return the dtype and shape of an array, such as ``float64 (40, 40, 2, 2)``; for other objects, the repr."""
     dtype, shape = getattr(value, "dtype", None), getattr(value, "shape", None)

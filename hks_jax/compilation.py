@@ -108,6 +108,11 @@ def numpy_where_known(most: int = _FEW, **settings: Any) -> Callable[[Callable[.
     return decorate
 
 
+def library_of(*arrays: Any) -> Any:
+    """Return `numpy` if all arrays are NumPy's, and otherwise `jax.numpy`: the library that computes with them."""
+    return np if all(isinstance(array, np.ndarray | np.generic) for array in arrays) else jnp
+
+
 def by_numpy(function: Callable[..., Any], *args: Any) -> Any:
     """Evaluate a function with NumPy arrays and SciPy matrices; return its result as JAX arrays."""
 

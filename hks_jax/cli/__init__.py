@@ -95,8 +95,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code: 0 success, 1 failed computation, 2 bad input, 130 interrupt.
 
     Results are written atomically and together at the end, so a failed command writes no file, except for the files of
-    `batch` and `bids`, the checkpoint of `fit` and the eigenpairs of `hks`. Pictures are drawn after the results are
-    written. No command replaces its input.
+    `batch` and `bids`, the checkpoints of `fit` and `hks`, and the eigenpairs of `hks`. Pictures are drawn after the
+    results are written. No command replaces its input.
     """
     argv, parser = sys.argv[1:] if argv is None else argv, build_parser()
     if not argv:

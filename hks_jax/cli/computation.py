@@ -18,7 +18,7 @@ from hks_jax.cli.progress import Progress
 from hks_jax.domain.tensor_checks import Interpolation, MetricChoice, OperatorChoice
 from hks_jax.eigen.automatic import choose_for_command, choose_solvers
 from hks_jax.eigen.weyl import weyl
-from hks_jax.fem.boundary import BoundarySpec, default_boundary, unreached_sides
+from hks_jax.fem.boundary import BoundarySpec, default_boundary
 from hks_jax.io import TensorVolume
 from hks_jax.io.result import Result
 from hks_jax.io.units import median_mean_diffusivity, unit_of_times
@@ -257,12 +257,9 @@ def compute_pairs(
         if boundary is None:
             boundary, why = default_boundary(inside)
             progress.note(f"boundary {boundary} ({why})")
-        unreached = unreached_sides(inside, boundary)
     else:
-        boundary, nodes, unreached = boundary or "neumann", f"{len(field.vertices)} vertices", []
+        boundary, nodes = boundary or "neumann", f"{len(field.vertices)} vertices"
     with progress.stage("assembly", nodes):
-        for message in unreached:
-            progress.warn(message)
         pencil = hj.assemble(field, boundary)
     unknowns, dimension = sum(part.space.n_dof for part in pencil.parts), pencil.space.dimension
     assert dimension is not None
@@ -316,9 +313,9 @@ def _report(settings: Settings, pairs: hj.Eigenpairs, times: tuple[float, ...]) 
         **{name: getattr(estimate, name) for name in ("resolution_bias", "lasting_bias", "coarse_fraction")},
     }
     rows = zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True)
-    settings = replace(settings, times=Times(times, settings.times.automatic), k=pairs.k)
+    origin = "automatic" if settings.times.automatic else "explicit"
     return {
-        "settings": {**asdict(settings), "times": "automatic" if settings.times.automatic else "explicit"},
+        "settings": {**asdict(settings), "times": origin, "k": pairs.k},
         "eigenpairs": describe_pairs(pairs),
         "times": [dict(zip(columns, row, strict=True)) for row in rows],
     }

@@ -29,7 +29,6 @@ from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.parsing import boundary_conditions, weight
 from hks_jax.cli.progress import Progress
 from hks_jax.domain import spd
-from hks_jax.fem.boundary import unreached_sides
 from hks_jax.io import ORDERS, read_tensors, save, save_tensors
 from hks_jax.io.formats import format_of
 from hks_jax.io.json_files import tuples
@@ -178,8 +177,6 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
             args.boundary = recorded or "neumann"
             origin = "recorded in the target" if recorded else "the default, because the target has none"
             progress.note(f"boundary {json.dumps(args.boundary)} ({origin})")
-    for message in unreached_sides(grid.inside, args.boundary):
-        progress.warn(message)
     weights = ((H1, args.h1), (TotalVariation, args.tv))
     with progress.stage("fitting", f"{args.parametrisation}, {int(grid.inside.sum())} nodes"):
         fit = fit_metric(

@@ -38,7 +38,6 @@ from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.parsing import boundary_conditions
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import Reading, read_grid
-from hks_jax.fem.boundary import unreached_sides
 from hks_jax.io import read_maps, save
 from hks_jax.io.cortex import MAPS
 from hks_jax.io.formats import WRITTEN
@@ -142,10 +141,7 @@ def _on_grid(args: argparse.Namespace, progress: Progress) -> OfVolume:
     require_grid_options(args)
     metric = None if args.operator == "fick" else "inverse"
     reading = Reading.of(args, file=args.tensors, metric=metric)
-    domain = read_grid(reading, Settings.of(args, metric=metric), progress)
-    for message in unreached_sides(domain.field.grid.inside, args.boundary):
-        progress.warn(message)
-    return domain
+    return read_grid(reading, Settings.of(args, metric=metric), progress)
 
 
 def _on_mesh(args: argparse.Namespace, progress: Progress) -> OfMesh:

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from hks_jax.arrays import StaticArray, describe_array, library_of
+from hks_jax.arrays import StaticArray, describe_array
 from hks_jax.checks import real_array
-from hks_jax.compilation import numpy_where_known
+from hks_jax.compilation import library_of, numpy_where_known
 from hks_jax.domain import spd
 from hks_jax.domain.simplices import WORDS, check_metric, check_places, checked_cells, checked_mask
 from hks_jax.domain.tensor_checks import (

@@ -41,9 +41,13 @@ def pairs_of_pencils(
     concrete values, each problem is first solved for an equal share of the k pairs plus a margin, and again for twice
     as many pairs while some of its pairs may be missing.
     """
-    limits, starts = _limits(pencil, k), _starts(start, pencil)
-    solvers = _solvers(solver, pencil, k, limits)
-    problems = [_Problem(*each) for each in zip(pencil.parts, solvers, limits, starts, strict=True)]
+    solvers, starts = choose_solvers(solver, pencil, k), _starts(start, pencil)
+    if len(pencil.parts) == 1:
+        return _solved(_Problem(pencil.parts[0], solvers[0], k, starts[0]), k, throw, report)
+    problems = []
+    for part, own, including, rows in zip(pencil.parts, solvers, pencil.including, starts, strict=True):
+        limit = min(max(k // len(including), 1), part.size)
+        problems.append(_Problem(part, _able(own, part, limit), limit, rows))
     share = k if is_traced(jax.lax.stop_gradient(pencil)) else _share(pencil, k)
     wanted = [min(each.limit, max(share, 0 if each.start is None else each.start.k)) for each in problems]
     pairs: dict[int, PencilEigenpairs] = {}
@@ -52,15 +56,7 @@ def pairs_of_pencils(
             if wanted[i]:
                 pairs[i] = _solved(each, wanted[i], throw, _of_problem(report, i, wanted))
         wanted = _missing(problems, pairs, k)
-    if len(pairs) == 1:
-        return pairs[0]
     return DoubledEigenpairs.of(list(pairs.values()), k).keeping(jax_array(np.ones(k, bool)))
-
-
-def _limits(pencil: AnyPencil, k: int) -> list[int]:
-    """Return, for each problem, the largest possible number of its pairs among the k lowest pairs of all problems."""
-    shares = zip(pencil.including, pencil.parts, strict=True)
-    return [min(max(k // len(including), 1), part.size) for including, part in shares]
 
 
 def _starts(start: Eigenpairs | None, pencil: AnyPencil) -> Sequence[PencilEigenpairs | None]:
@@ -74,17 +70,10 @@ def _starts(start: Eigenpairs | None, pencil: AnyPencil) -> Sequence[PencilEigen
     return problems
 
 
-def _solvers(
-    solver: str | Eigensolver, pencil: AnyPencil, k: int, limits: Sequence[int]
-) -> list[tuple[Eigensolver, ...]]:
-    """Return the solvers of each problem; for a small problem of a doubled domain the dense one, which has no limit."""
-    solvers = choose_solvers(solver, pencil, k)
-    if len(solvers) > 1:
-        for i, (part, limit) in enumerate(zip(pencil.parts, limits, strict=True)):
-            first = solvers[i][0]
-            if limit >= first.max_pairs(part.size):
-                solvers[i] = (Dense(first.tolerance),)
-    return solvers
+def _able(solvers: tuple[Eigensolver, ...], pencil: Pencil, limit: int) -> tuple[Eigensolver, ...]:
+    """Return the solvers, or for a small problem of a doubled domain the dense one, which has no limit."""
+    first = solvers[0]
+    return (Dense(first.tolerance),) if limit >= first.max_pairs(pencil.size) else solvers
 
 
 # By Weyl's law, a problem has N(λ) ≈ V λ^(3/2)/6π² ± S λ/16π eigenvalues below λ in 3D, and (A λ ± L √λ)/4π in 2D; S
@@ -97,8 +86,6 @@ _MARGIN = {2: 2.8, 3: 4.5}
 
 def _share(pencil: AnyPencil, k: int) -> int:
     """Return a number of pairs that each problem rarely exceeds among the k lowest pairs of all problems."""
-    if len(pencil.parts) == 1:
-        return k
     d, mean = pencil.space.dimension, k / len(pencil.parts)
     return math.ceil(mean + _MARGIN[d] * mean ** (1 - 1 / d)) + 4
 
@@ -138,4 +125,4 @@ def _of_problem(report: Report, number: int, wanted: list[int]) -> Report:
             left += later * (time.perf_counter() - begin + left)
         report(Status(f"problem {number + 1} of {of}: {text}", left))
 
-    return report if of == 1 else tell
+    return tell

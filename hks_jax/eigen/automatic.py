@@ -106,7 +106,7 @@ def _in_jax(pencil: Pencil, k: int) -> Eigensolver:
     volume = pencil.space.dimension == 3
     matrix_free = laplacian and isinstance(pencil.stiffness, StencilOperator) and (volume or not exact)
     candidates = ([ChebyshevFilter()] if matrix_free else []) + [BlockLanczos()]
-    # The driver computes one additional pair.
+    # `pairs_of_pencil` computes one additional pair.
     return next((solver for solver in candidates if k < solver.max_pairs(pencil.space.n_dof)), Dense())
 
 

@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.arrays import library_of
-from hks_jax.compilation import numpy_where_known
+from hks_jax.compilation import library_of, numpy_where_known
 from hks_jax.eigen.adjoints.complement import Adjoint, OfRows, Rows, Scalar, Values, Vectors, unsolved
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.rotations import gaps
@@ -70,19 +69,19 @@ def _solved_jvp(
     pencil, start, change = first_order_only(primals[0]), primals[1], changes[0]
     n_dof, adjoint = pencil.size, solver.adjoint
     guards = max(extra, min(solver.guards(k, n_dof), solver.max_pairs(n_dof) - k))
-    values, vectors, complete_below = one_by_one(_lowest, (solver, k + guards, report), pencil, start)
-    eigenvalues, functions, following, spare = _cut(values, vectors, k)
-    vectors = vectors if spare is None else vectors[: len(values)]
-    origin, solves = jnp.zeros((), values.dtype), _solves(pencil, k, len(values))
+    found, vectors, complete_below = one_by_one(_lowest, (solver, k + guards, report), pencil, start)
+    eigenvalues, functions, following, spare = _cut(found, vectors, k)
+    vectors = vectors if spare is None else vectors[: len(found)]
+    origin, from_origin, solves = jnp.zeros((), found.dtype), found, _solves(pencil, k, len(found))
     if solves and pencil.null_space is None:  # linear solves need K ⪰ 0
-        origin = _below(values, indistinct(pencil, values.dtype))
-        pencil, values = pencil.counted_from(origin), values - origin
+        origin = _below(found, indistinct(pencil, found.dtype))
+        pencil, from_origin = pencil.counted_from(origin), found - origin
     # Data from `prepare` do not depend on the pencil's tangent, so all products with one Jacobian share these data.
-    prepared = one_by_one(_prepare, (adjoint, k), pencil, values) if solves else None
+    prepared = one_by_one(_prepare, (adjoint, k), pencil, from_origin) if solves else None
     # Metric and density are removed: derivatives do not need them, and reverse mode would store their arrays.
     pencil = replace(pencil, metric=None, density=None)
     on_failure: OnFailure = "error" if throw else "nothing" if is_traced(primals) else "warning"
-    constants, settings = _Constants(prepared, pencil, origin, values, vectors, functions), (adjoint, on_failure)
+    constants, settings = _Constants(prepared, pencil, origin, from_origin, vectors, functions), (adjoint, on_failure)
     tangents = linear_program(_tangents, settings, (constants,), change, (eigenvalues, functions), _by_numpy)
     others = following if extra else jnp.full_like(following, jnp.inf), complete_below, spare
     return (eigenvalues, functions, *others), (*tangents, *jax.tree.map(jnp.zeros_like, others))

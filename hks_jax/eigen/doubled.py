@@ -10,8 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hks_jax.arrays import library_of
-from hks_jax.compilation import numpy_where_known
+from hks_jax.compilation import library_of, numpy_where_known
 from hks_jax.eigen.eigenpairs import Eigenpairs, PencilEigenpairs, view
 from hks_jax.fem.pencil import Inclusions, MirrorPencil
 from hks_jax.traced import is_traced

@@ -1,4 +1,4 @@
-"""The driver: `eigenpairs` assembles matrices, chooses a solver, and truncates the spectrum."""
+"""The driver: `eigenpairs` assembles matrices, and truncates the spectrum of their lowest pairs."""
 
 from typing import Any, get_args
 
@@ -81,11 +81,11 @@ def eigenpairs(
         >>> print((hj.eigenpairs(flat, k=4).eigenvalues / jnp.pi**2).round(1))  # m² + n² on the unit square
         [0. 1. 1. 2.]
     """
-    pencil = pencil_of(domain, boundary, mass, quadrature)
+    require_static("k", k)
     if multiplet not in get_args(MultipletChoice):
         raise ValueError(f'multiplet: got {multiplet!r}; expected "report", "drop" or "complete"')
+    pencil = pencil_of(domain, boundary, mass, quadrature)
     total = sum(part.size for part in pencil.parts)
-    require_static("k", k)
     number = np.asarray(k)
     if number.ndim or number.dtype.kind not in "iuf" or number != number // 1 or not 1 <= number <= total:
         raise ValueError(

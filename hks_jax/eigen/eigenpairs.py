@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hks_jax.arrays import describe_array, jax_array, library_of
-from hks_jax.compilation import numpy_where_known
+from hks_jax.arrays import describe_array, jax_array
+from hks_jax.compilation import library_of, numpy_where_known
 from hks_jax.domain.tensor_checks import MANY
-from hks_jax.eigen.multiplets import MultipletChoice, Spectrum, is_unconfirmed, kept_of, number_cut, numbered
+from hks_jax.eigen.multiplets import Cut, MultipletChoice, Spectrum, cut_of, kept_of
 from hks_jax.eigen.quality import indistinct
 from hks_jax.eigen.rotations import of_simple, with_rotations
 from hks_jax.fem.pencil import AnyPencil, Pencil
@@ -187,12 +187,12 @@ class Eigenpairs(ABC):
     @property
     def cut_multiplet(self) -> Array:
         """The number of kept pairs of the multiple eigenvalue that the cut divides; 0 if the cut divides none."""
-        return number_cut(self._spectrum, self.kept)
+        return self._cut.cut_multiplet
 
     @property
     def multiplets(self) -> Int[Array, " k"]:
         """The number of the multiple eigenvalue that each eigenvalue belongs to, from 0, as `cut_multiplet` tells."""
-        return numbered(self._spectrum)
+        return self._cut.multiplets
 
     @property
     def _spectrum(self) -> Spectrum:
@@ -210,8 +210,12 @@ class Eigenpairs(ABC):
 
         If a lower bound of the spectrum is known, no certificate is needed, because some solvers give none.
         """
+        return self._cut.unconfirmed
+
+    @property
+    def _cut(self) -> Cut:
         optional = all(pencil.bounded for pencil in self._pencils)
-        return is_unconfirmed(self._spectrum, self.kept, jax.lax.stop_gradient(self.complete_below), optional)
+        return cut_of(self._spectrum, self.kept, jax.lax.stop_gradient(self.complete_below), optional)
 
     @property
     def uncertain(self) -> Bool[Array, " k"]:

@@ -4,8 +4,7 @@ from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 
-from hks_jax.arrays import library_of
-from hks_jax.compilation import numpy_where_known
+from hks_jax.compilation import library_of, numpy_where_known
 
 
 class Spectrum(NamedTuple):
@@ -38,34 +37,27 @@ def gaps_to_next(spectrum: Spectrum) -> Any:
     return xp.maximum(xp.maximum(tolerance * (values - origin), stored), xp.maximum(rounding, finfo.tiny))
 
 
+class Cut(NamedTuple):
+    """The multiple eigenvalues of a spectrum, and doubts about its last kept pairs; see `Eigenpairs`."""
+
+    multiplets: Any  # (k,) the number of the multiple eigenvalue that each eigenvalue belongs to
+    cut_multiplet: Any  # the number of kept pairs of the multiple eigenvalue that the cut divides
+    unconfirmed: Any  # whether the solver's certificate ends below the last kept eigenvalue
+
+
 @numpy_where_known(static_argnums=3)
-def is_unconfirmed(spectrum: Spectrum, kept: Any, bound: Any, optional: bool) -> Any:
-    """Return whether the bound of a certificate, which may be ``optional``, is below the last kept eigenvalue."""
+def cut_of(spectrum: Spectrum, kept: Any, bound: Any, optional: bool) -> Cut:
+    """Return the cut after the kept pairs; the certificate, which may be ``optional``, ends at ``bound``."""
     xp = library_of(kept)
-    last = xp.sum(kept) - 1
+    values, ends, count = spectrum.values, _ends_of_multiplets(spectrum), xp.sum(kept)
+    numbers = xp.cumsum(ends, dtype=xp.int32) - ends.astype(xp.int32)
+    last, beyond = values[count - 1], xp.append(values, spectrum.following)[count]
+    whole = ends[count - 1] | xp.isnan(beyond - last)  # pairs that were not found are NaN
+    begin = xp.max(xp.where(ends & (xp.arange(len(kept)) < count), xp.arange(1, len(kept) + 1), 0))
     # The solver counts outside of the copies' errors.
     shifted = spectrum._replace(rounding=_SHIFTED * spectrum.rounding)
-    needed = spectrum.values[last] - 2 * gaps_to_next(shifted)[last]
-    return bound < needed if optional else ~(bound >= needed)
-
-
-@numpy_where_known()
-def number_cut(spectrum: Spectrum, kept: Any) -> Any:
-    """Return `Eigenpairs.cut_multiplet`."""
-    xp = library_of(kept)
-    count = xp.sum(kept)
-    ends, index = _ends_of_multiplets(spectrum), xp.arange(len(kept))
-    beyond = xp.append(spectrum.values, spectrum.following)[count]
-    whole = ends[count - 1] | xp.isnan(beyond - spectrum.values[count - 1])  # pairs that were not found are NaN
-    return xp.where(whole, 0, count - xp.max(xp.where(ends & (index < count), index + 1, 0)))
-
-
-@numpy_where_known()
-def numbered(spectrum: Spectrum) -> Any:
-    """Return `Eigenpairs.multiplets`."""
-    xp = library_of(spectrum.values)
-    ends = _ends_of_multiplets(spectrum).astype(xp.int32)
-    return xp.cumsum(ends, dtype=xp.int32) - ends
+    needed = last - 2 * gaps_to_next(shifted)[count - 1]
+    return Cut(numbers, xp.where(whole, 0, count - begin), bound < needed if optional else ~(bound >= needed))
 
 
 def _ends_of_multiplets(spectrum: Spectrum) -> Any:

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hks_jax.arrays import jax_array, library_of
-from hks_jax.compilation import is_concrete_on_cpu, numpy_where_known
+from hks_jax.arrays import jax_array
+from hks_jax.compilation import is_concrete_on_cpu, library_of, numpy_where_known
 from hks_jax.eigen.derivative import solved
 from hks_jax.eigen.eigenpairs import UNCERTAIN, PencilEigenpairs
 from hks_jax.eigen.quality import (
@@ -42,7 +42,7 @@ def pairs_of_pencil(
 ) -> PencilEigenpairs:
     """Return the k lowest pairs, from those of a similar pencil (``start``). See `solved` for ``throw``."""
     extra = min(1, pencil.size - k)  # the next eigenvalue shows whether k cuts a multiple eigenvalue
-    solver.require(pencil)
+    solver = _able(solver, pencil, k, extra)
     inner = boxed = pencil
     if not isinstance(solver, Dense):
         inner = cropped(pencil)  # with the same unknowns
@@ -51,14 +51,13 @@ def pairs_of_pencil(
     if start is not None and start.spare is not None:
         rows = start.space.transfer(jnp.concatenate([start.frame, start.spare]), pencil.space)
         rows = inner.space.transfer(rows, boxed.space)
-    # Where NumPy computes in float64, it finds null vectors and eigenvalues near zero that rounding to float32 hides.
-    single_on_host = boxed.stiffness.dtype == np.float32 and is_concrete_on_cpu(jax.lax.stop_gradient((boxed, rows)))
-    solver = _able(solver, boxed, k, extra)
-    boxed = _with_balance(boxed) if single_on_host else boxed
+    # NumPy computes in float64, and finds null vectors and eigenvalues near zero that rounding to float32 hides.
+    on_host = is_concrete_on_cpu(jax.lax.stop_gradient((boxed, rows)))
+    boxed = _with_balance(boxed) if on_host and boxed.stiffness.dtype == np.float32 else boxed
     values, frame, following, bound, spare = solved(solver, boxed, k, extra, throw, report, rows)
     # While differentiating, JAX may turn a constant array into a Python number.
     following, bound = jax_array(following), jax_array(bound)
-    values, quality = _judged(boxed, solver, values, frame, following, single_on_host)
+    values, quality = _judged(boxed, solver, values, frame, following, on_host)
     return PencilEigenpairs(
         eigenvalues=values,
         kept=jax_array(np.ones(k, bool)),
@@ -73,7 +72,11 @@ def pairs_of_pencil(
 
 
 def _able(solver: Eigensolver, pencil: Pencil, k: int, extra: int) -> Eigensolver:
-    """Return the solver, or the dense one if the solver cannot compute k pairs and K may be indefinite."""
+    """Return the solver, or the dense one if the solver cannot compute k pairs and K may be indefinite.
+
+    Raises ValueError if the solver does not support the pencil, or cannot compute k pairs.
+    """
+    solver.require(pencil)
     n_dof, most = pencil.size, solver.max_pairs(pencil.size)
     if k + extra <= most:
         return solver
@@ -99,15 +102,16 @@ def _with_balance(pencil: Pencil) -> Pencil:
 
 
 def _judged(
-    pencil: Pencil, solver: Eigensolver, values: Array, vectors: Array, following: Array, single_on_host: bool
+    pencil: Pencil, solver: Eigensolver, values: Array, vectors: Array, following: Array, on_host: bool
 ) -> tuple[Array, dict[str, Array]]:
     """Return the eigenvalues, where those near zero may be more accurate, and the indicators of the pairs' quality."""
     null_space_known = pencil.null_space is not None
     constants = jax.lax.stop_gradient((pencil, vectors, values, following))
     matrices = tabulated(SymmetricPencil(constants[0].stiffness, constants[0].mass))
-    settings = pencil.n_null, solver.tolerance, null_space_known, solver.in_double and single_on_host
+    accurate = solver.in_double and on_host and values.dtype == np.float32
+    settings = pencil.n_null, solver.tolerance, null_space_known, accurate
     residuals, converged, zero, tolerance = _quality(matrices, *constants[1:], constants[0].lower_bound, *settings)
-    small, rounding = _near_zero(*constants[:3], zero, solver.in_double, single_on_host)
+    small, rounding = _near_zero(*constants[:3], zero, accurate, on_host)
     if not null_space_known:
         values = _with_small(values, constants[2], zero, small)
     origin = jnp.zeros((), values.dtype) if null_space_known else jax.lax.stop_gradient(values[0])
@@ -128,39 +132,36 @@ def _with_small(values: Any, constant: Any, zero: Any, small: Any) -> Any:
 
 
 def _near_zero(
-    pencil: Pencil, vectors: Array, values: Array, zero: Array, accurate: bool, single_on_host: bool
+    pencil: Pencil, vectors: Array, values: Array, zero: Array, accurate: bool, on_host: bool
 ) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
     """Return the eigenvalues that are zero within rounding, with 0 for the others, and `Eigenpairs.rounding`.
 
     In float32, eigenvalues that are zero within rounding may be accurate in float64, in which the host computes. In
     float64, they may be accurate if their eigenvectors are small where entries of K are large.
-    ``accurate`` states whether the solver computed in float64.
+    ``accurate`` states whether the solver computed float32 pairs in float64.
     """
-    nothing, null_space_known = jax_array(np.zeros(values.shape, values.dtype)), pencil.null_space is not None
-    small, rounding = np.zeros((2, values.size), values.dtype)
-    if values.dtype != np.float32:
-        if null_space_known or not is_concrete_on_cpu((pencil, vectors, zero)) or not np.any(zero):
-            return nothing, nothing
-        where = np.flatnonzero(zero)
-        quotients, changes, residuals = near_zero(pencil, np.asarray(vectors)[where], False)
-        # Rounding of the vectors changes quotients by its square. Sums over many nodes round repeatedly.
-        least = (_REPEATED * np.finfo(float).eps) ** 2 * float(largest(pencil))
-        sure = np.abs(quotients) > np.maximum(_REPEATED * changes, least)
-        small[where], rounding[where] = np.where(sure, quotients, 0), np.where(sure, np.maximum(changes, residuals), 0)
-        small[where] = np.maximum.accumulate(small[where])
-        return jax.device_put((small, rounding))
-    if not single_on_host:
-        return nothing, nothing if null_space_known else jnp.where(zero, indistinct(pencil, values.dtype), 0)
-    near = np.abs(np.asarray(values)) <= float(indistinct(pencil, values.dtype)) / UNCERTAIN
-    where = np.flatnonzero(near & (np.arange(values.size) >= pencil.n_null))
-    if where.size and null_space_known and not accurate:
+    dtype, single, null_space_known = values.dtype, values.dtype == np.float32, pencil.null_space is not None
+    nothing = jax_array(np.zeros(values.shape, dtype))
+    if not on_host:
+        return nothing, jnp.where(zero, indistinct(pencil, dtype), 0) if single and not null_space_known else nothing
+    near = np.asarray(zero) & (not null_space_known)
+    if single:
+        near = np.abs(np.asarray(values)) <= float(indistinct(pencil, dtype)) / UNCERTAIN
+        near &= np.arange(values.size) >= pencil.n_null
+    where = np.flatnonzero(near)
+    if not where.size:
+        return nothing, nothing
+    small, rounding = np.zeros((2, values.size), dtype)
+    if null_space_known and not accurate:
         rounding[where] = rounding_of_quotients(pencil, vectors, where)
-    elif where.size:
-        quotients, changes, _ = near_zero(pencil, np.asarray(vectors)[where], accurate)
-        # Rounding of the vectors to float32 changes quotients by its square.
-        exact = np.abs(quotients) <= np.finfo(np.float32).eps ** 2 * float(largest(pencil))
-        small[where], rounding[where] = np.where(exact, 0, quotients), np.where(exact, 0, changes)
-        small[where] = np.maximum.accumulate(small[where])
+        return jax.device_put((small, rounding))
+    quotients, changes, residuals = near_zero(pencil, np.asarray(vectors)[where], accurate)
+    # Rounding of the vectors changes quotients by its square. In float64, sums over many nodes round repeatedly.
+    least: Any = (np.finfo(dtype).eps * (1 if single else _REPEATED)) ** 2 * float(largest(pencil))
+    if not single:
+        least, changes = np.maximum(_REPEATED * changes, least), np.maximum(changes, residuals)
+    sure = np.abs(quotients) > least
+    small[where], rounding[where] = np.maximum.accumulate(np.where(sure, quotients, 0)), np.where(sure, changes, 0)
     return jax.device_put((small, rounding))
 
 

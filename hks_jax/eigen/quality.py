@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hks_jax.arrays import library_of
-from hks_jax.compilation import numpy_where_known
+from hks_jax.compilation import library_of, numpy_where_known
 from hks_jax.linear.products import of_each_column, products_with_columns, row_blocks
 from hks_jax.linear.symmetric_pencil import SymmetricPencil, change_by_rounding
 

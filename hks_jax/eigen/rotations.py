@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from hks_jax.arrays import library_of
-from hks_jax.compilation import numpy_where_known
+from hks_jax.compilation import library_of, numpy_where_known
 from hks_jax.eigen.adjoints.complement import OfRows, Rows, Scalar, Values
 from hks_jax.eigen.quality import indistinct
 from hks_jax.fem.pencil import Pencil

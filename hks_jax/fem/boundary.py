@@ -96,17 +96,27 @@ def default_boundary(inside: Bool[np.ndarray, "*shape"]) -> tuple[str, str]:
     )
 
 
-def unreached_sides(inside: Bool[np.ndarray, "*shape"], boundary: BoundarySpec) -> list[str]:
-    """Return a warning for each condition on a side of the grid that the mask does not reach."""
-    *axes, (rim, _) = normalise_boundary(boundary, inside.ndim)
+def without_effect(grid: Grid, boundary: BoundarySpec) -> str:
+    """Return a warning of conditions where the grid's domain has no boundary, or an empty string."""
+    *axes, (rim, _) = normalise_boundary(boundary, grid.dimension)
+    if grid.inside.all() and rim == "dirichlet" and not any("dirichlet" in pair for pair in axes):
+        where = "acts nowhere: there is no mask, and so no rim. Leave this condition out"
+        return f'boundary: got {boundary!r}, but "dirichlet" {where}'
+    found = {}
+    for axis, (name, conditions) in enumerate(zip("xyz", axes, strict=False)):
+        reached = [bool(np.take(grid.inside, index, axis).any()) for index in (0, -1)]
+        if conditions[0] == "periodic":  # needs both sides
+            reached = [all(reached)] * 2
+        for side, condition, here in zip(("low", "high"), conditions, reached, strict=True):
+            if not here and condition not in ("neumann", rim):
+                found[f"the {side} side of {name}"] = condition
+    if not found:
+        return ""
+    conditions = dict.fromkeys(found.values())
+    names = " and ".join(f'"{name}"' for name in conditions) + (" has" if len(conditions) == 1 else " have")
+    where = "any side of the grid" if len(found) == 2 * grid.dimension else ", ".join(found)
     own = 'has the natural condition, unless you pass "dirichlet-rim" or "mean"' if rim == "neumann" else f'has "{rim}"'
-    return [
-        f'boundary: "{condition}" has no effect at the {side} side of {name}, which the mask does not reach; '
-        f"the rim of the mask {own}"
-        for axis, (name, conditions) in enumerate(zip("xyz", axes, strict=False))
-        for side, index, condition in zip(("low", "high"), (0, -1), conditions, strict=True)
-        if condition not in ("neumann", rim) and not np.take(inside, index, axis).any()
-    ]
+    return f"boundary: {names} no effect at {where}, which the mask does not reach; the rim of the mask {own}"
 
 
 def doubled_problems(boundary: tuple[Sides, ...]) -> list[tuple[Sides, ...]]:

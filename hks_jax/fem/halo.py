@@ -11,7 +11,7 @@ import numpy as np
 from jax.sharding import AxisType, Mesh
 from jaxtyping import Array, Float
 
-from hks_jax.arrays import library_of
+from hks_jax.compilation import library_of
 
 
 def with_rim(x: Any, periodic: tuple[bool, ...], first: int = 0) -> Any:
@@ -29,7 +29,7 @@ def neighbours(x: Any, dimension: int) -> Iterator[Any]:
     for start in product((0, 1, 2), repeat=dimension):
         start = (*start, *after)
         end = [s + n for s, n in zip(start, shape, strict=True)]
-        yield x[tuple(map(slice, start, end))] if isinstance(x, np.ndarray) else jax.lax.slice(x, start, end)
+        yield x[tuple(map(slice, start, end))] if library_of(x) is np else jax.lax.slice(x, start, end)
 
 
 def side_by_side(coefficients: Float[Array, "offsets *shape"]) -> Float[Array, " entries"]:

@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hks_jax.arrays import library_of
 from hks_jax.checks import real_array
-from hks_jax.compilation import jit_quickly, numpy_where_known
+from hks_jax.compilation import jit_quickly, library_of, numpy_where_known
 from hks_jax.domain import spd
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.simplicial_mesh import SimplicialMesh, oriented

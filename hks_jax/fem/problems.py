@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.fem.boundary import BoundarySpec, doubled_problems, normalise_boundary
+from hks_jax.fem.boundary import BoundarySpec, doubled_problems, normalise_boundary, without_effect
 from hks_jax.fem.space import FunctionSpace, GridSpace, MeshSpace, grid_space, mesh_space
 
 MESH_BOUNDARIES = ("neumann", "dirichlet", "mean")
@@ -24,7 +24,8 @@ def problems_of(
             that has no inner nodes.
 
     Warns:
-        AccuracyWarning: the mask does not reach the sides of the grid on which ``"dirichlet"`` acts.
+        AccuracyWarning: a condition has no effect, because the mask does not reach its side of the grid, or because
+            there is no mask.
     """
     spaces: list[GridSpace] | list[MeshSpace]
     if isinstance(domain, SimplicialMesh):
@@ -37,14 +38,6 @@ def problems_of(
         sides = normalise_boundary(boundary, domain.grid.dimension)
         spaces = _spaces(lambda problem: grid_space(domain.grid, problem), doubled_problems(sides), boundary)
         mirrored = any("mirror" in pair for pair in sides)
-        if any("dirichlet" in pair for pair in sides) and (spaces[0].free == spaces[0].domain).all():
-            where = (
-                "acts on the sides of the grid, which the mask does not reach. For the rim of the mask pass "
-                '"dirichlet-rim"'
-                if sides[-1] == ("neumann", "neumann")
-                else "acts nowhere: there is no mask, and so no rim. Leave this condition out"
-            )
-            warn_of_accuracy(f'boundary: got {boundary!r}, but "dirichlet" {where}')
     if len(spaces) > 1 and spaces[0].n_dof == spaces[-1].n_dof:  # all problems are the same
         raise ValueError(
             'boundary: got "mirror", but the mask reaches no side of the grid, where the mirrors are. Pass "mean" '
@@ -52,6 +45,8 @@ def problems_of(
             if mirrored
             else 'boundary: got "mean", but the domain has no rim; pass "neumann"'
         )
+    if isinstance(domain, TensorField) and (message := without_effect(domain.grid, boundary)):
+        warn_of_accuracy(message)
     return spaces
 
 

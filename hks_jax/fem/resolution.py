@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from hks_jax.arrays import library_of
-from hks_jax.compilation import jit_quickly, numpy_where_known
+from hks_jax.compilation import jit_quickly, library_of, numpy_where_known
 from hks_jax.domain import spd
 from hks_jax.domain.tensor_checks import Interpolation
 from hks_jax.fem.space import FunctionSpace, GridSpace, MeshSpace, mask_for

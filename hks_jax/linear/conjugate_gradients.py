@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
-from hks_jax.arrays import library_of
+from hks_jax.compilation import library_of
 from hks_jax.linear.loops import when, while_loop
 from hks_jax.linear.products import matmul, products_with_columns
 

@@ -11,7 +11,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from hks_jax.arrays import library_of
+from hks_jax.compilation import library_of
 from hks_jax.linear import accelerators
 from hks_jax.linear.linear_map import with_transpose
 

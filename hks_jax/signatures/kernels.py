@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hks_jax.arrays import library_of, nan_is_meant
+from hks_jax.arrays import nan_is_meant
 from hks_jax.checks import require_count, require_number, require_real
-from hks_jax.compilation import numpy_where_known
+from hks_jax.compilation import library_of, numpy_where_known
 from hks_jax.eigen.eigenpairs import Eigenpairs, require_pairs
 from hks_jax.signatures.filters import Custom, Derivative, Heat, Wave
 from hks_jax.signatures.spectral_functions import source_indices, spectral_columns, spectral_diagonal, spectral_trace

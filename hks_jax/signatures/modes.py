@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.arrays import ByKey, library_of, nan_is_meant
+from hks_jax.arrays import ByKey, nan_is_meant
 from hks_jax.checks import real_array, require_number, require_real
-from hks_jax.compilation import numpy_where_known
+from hks_jax.compilation import library_of, numpy_where_known
 from hks_jax.eigen.eigenpairs import Eigenpairs, require_pairs
 from hks_jax.fem.resolution import mean_diffusivity
 from hks_jax.linear import lapack

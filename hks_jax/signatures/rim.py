@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hks_jax.arrays import library_of, nan_is_meant, nan_outside
-from hks_jax.compilation import jit_quickly, numpy_where_known
+from hks_jax.arrays import nan_is_meant, nan_outside
+from hks_jax.compilation import jit_quickly, library_of, numpy_where_known
 from hks_jax.domain.components import boundary_nodes
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField

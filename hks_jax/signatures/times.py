@@ -9,9 +9,8 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Bool, Float
 
-from hks_jax.arrays import library_of
 from hks_jax.checks import checked_times, require_count
-from hks_jax.compilation import numpy_where_known
+from hks_jax.compilation import library_of, numpy_where_known
 from hks_jax.domain.components import active_elements, boundary_nodes, label_nodes
 from hks_jax.eigen.eigenpairs import Eigenpairs, require_pairs
 from hks_jax.eigen.weyl import weyl, weyl_number

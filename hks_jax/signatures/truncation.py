@@ -15,8 +15,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 
 from hks_jax.accuracy import warn_of_accuracy
-from hks_jax.arrays import describe_array, library_of, nan_is_meant
-from hks_jax.compilation import jit_quickly, numpy_where_known
+from hks_jax.arrays import describe_array, nan_is_meant
+from hks_jax.compilation import jit_quickly, library_of, numpy_where_known
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.resolution import Resolution
 from hks_jax.fem.space import mask_for

@@ -139,6 +139,7 @@ def test_the_compiler_computes_nothing_with_the_grid(name, masks):
         ((20, 18), "neumann", (20, 18)),
     ],
 )
+@pytest.mark.filterwarnings("ignore:boundary.*which the mask does not reach")
 def test_a_cropped_grid_has_the_same_matrices(rng, shape, boundary, smaller):
     centre, radii = [10, *(n // 2 for n in shape[1:])], [10.5, *(0.28 * n for n in shape[1:])]
     away = (np.moveaxis(np.indices(shape), 0, -1) - centre) / radii

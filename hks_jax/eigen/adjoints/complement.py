@@ -18,8 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from hks_jax.arrays import library_of
 from hks_jax.checks import require_number
+from hks_jax.compilation import library_of
+from hks_jax.linear.conjugate_gradients import conjugate_gradients
 from hks_jax.linear.operators import OfColumns
 from hks_jax.linear.products import even_size, inner_products, matmul, products_with_columns, row_blocks
 from hks_jax.linear.symmetric_pencil import P, SymmetricPencil
@@ -204,29 +205,42 @@ def projected(
     return left, wanted_errors(before, after, amplified, tolerance, rhs.dtype)
 
 
-def solve_in_blocks(
-    solver_of: Callable[[Int[Array, ""]], Callable[..., Columns]],  # returns the solver for a group's blocks
-    size: int,  # the number of rows per block
-    first: Int[np.ndarray, " groups"],  # the first row of each group of blocks
+def solve_by_blocks(
+    pencil: SymmetricPencil,
+    values: Values,
+    vectors: Vectors,
     rhs: Rows,
-    wanted: OfRows,  # the wanted error of each solution; if infinite, the solution is zero
+    tolerance: float,
+    size: int,  # the number of right-hand sides per block
+    first: Int[np.ndarray, " groups"],  # the first row of each group of blocks
+    # maps a group, and then its block's part of ``of_rows``, to the function from residuals r to approximations of
+    # (K − λᵢM)⁻¹r on the complement; the function must be symmetric and positive definite there, and must not leave it
+    preconditioner: Callable[[Int[Array, ""]], Callable[..., OfColumns]],
     *of_rows: OfRows,
+    clean: OfColumns | None = None,
 ) -> Rows:
-    """Solve the linear systems for blocks of right-hand sides (rows), one block after another."""
-    size = min(size, len(rhs))
-    starts, _ = row_blocks(len(rhs), size)
+    """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0 in JAX, by conjugate gradients for one block after another.
+
+    See `Adjoint.solve`, and `conjugate_gradients` for ``clean``.
+    """
+    k, beyond = len(rhs), first_beyond(values)
+    stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
+    left, wanted = projected(pencil, vectors, rhs, tolerance, amplification(values, k))
+    size = min(size, k)
+    starts, _ = row_blocks(k, size)
     blocks = jnp.asarray(np.append(first // size, len(starts)))
 
     def solve_group(group: Array, x: Rows) -> Rows:
-        solve = solver_of(group)
+        of_block = preconditioner(group)
 
         def solve_block(number: Array, x: Rows) -> Rows:
-            start = jnp.asarray(starts)[number]
-            b, error, *own = (jax.lax.dynamic_slice_in_dim(each, start, size) for each in (x, wanted, *of_rows))
+            start, rows = jnp.asarray(starts)[number], (x, wanted, values[:k], *of_rows)
+            b, error, shifts, *own = (jax.lax.dynamic_slice_in_dim(each, start, size) for each in rows)
             unsolved = start + np.arange(size) >= number * size  # the last two blocks may overlap
-            solution = solve(b.T, jnp.where(unsolved, error, jnp.inf), *own).T
+            product, error = definite_product(stiffness, mass, shifts, beyond), jnp.where(unsolved, error, jnp.inf)
+            solution = conjugate_gradients(product, of_block(*own), b.T, error, clean=clean).converged.T
             return jax.lax.dynamic_update_slice_in_dim(x, jnp.where(unsolved[:, None], solution, b), start, axis=0)
 
         return jax.lax.fori_loop(blocks[group], blocks[group + 1], solve_block, x)
 
-    return jax.lax.fori_loop(0, len(first), solve_group, rhs)
+    return jax.lax.fori_loop(0, len(first), solve_group, left)

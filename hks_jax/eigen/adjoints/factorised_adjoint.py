@@ -17,10 +17,10 @@ from jaxtyping import Array, Int
 
 from hks_jax.compilation import is_concrete_on_cpu, jit_quickly
 from hks_jax.eigen.adjoints import complement
-from hks_jax.eigen.adjoints.complement import Adjoint, Columns, OfRows, Rows, Shifts, Values, Vectors
-from hks_jax.linear.conjugate_gradients import conjugate_gradients
+from hks_jax.eigen.adjoints.complement import Adjoint, Columns, Rows, Shifts, Values, Vectors
 from hks_jax.linear.dissection import Dissection, dissect
 from hks_jax.linear.multifrontal import Factorisation, factorise
+from hks_jax.linear.operators import OfColumns
 from hks_jax.linear.products import matmul, products_with_columns
 from hks_jax.linear.symmetric_pencil import SymmetricPencil
 
@@ -86,15 +86,13 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
         """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`."""
         factors, shifts = prepared
         k, tolerance = len(rhs), complement.attainable(self.tolerance, rhs.dtype)
-        beyond, clean = complement.first_beyond(values), complement.without_known(pencil, vectors)
-        stiffness, mass = pencil.stiffness.of_columns(), pencil.mass.of_columns()
         window = WINDOW if _GROWTH * jnp.finfo(rhs.dtype).eps <= tolerance else len(values)
 
         # If rounding leaves a component of the residual along a computed eigenvector φⱼ, each step multiplies this
         # component by (λⱼ − λᵢ)/(λⱼ − σ), which is large mainly for λⱼ near σ. So each step projects out only the
         # eigenvectors φⱼ with λⱼ nearest to σ, unless the others would spoil the last digits that the tolerance asks
         # for. Restarts project out all computed eigenvectors.
-        def solver_of(group: Int[Array, ""]) -> Callable[..., Columns]:
+        def preconditioner(group: Int[Array, ""]) -> Callable[[], OfColumns]:
             factor = Factorisation(factors.dissection, *jax.tree.map(lambda stacked: stacked[group], factors.arrays))
             near = vectors[jnp.argsort(jnp.abs(values - shifts[group]))[:window]]
             columns, images = near.T, pencil.mass.apply(near)
@@ -103,15 +101,11 @@ class FactorisedAdjoint(Adjoint[SymmetricPencil]):
                 z = factor.solve(r)
                 return z - matmul(columns, products_with_columns(images, z))
 
-            def solve_block(b: Columns, wanted: OfRows, eigenvalues: OfRows) -> Columns:
-                product = complement.definite_product(stiffness, mass, eigenvalues, beyond)
-                return conjugate_gradients(product, precondition, b, wanted, clean=clean).converged
+            return lambda: precondition
 
-            return solve_block
-
-        left, wanted = complement.projected(pencil, vectors, rhs, tolerance, complement.amplification(values, k))
-        first, _ = self._groups(factors.dissection, len(values), k, values.dtype)
-        return complement.solve_in_blocks(solver_of, BLOCK, first, left, wanted, values[:k])
+        (first, _), clean = self._groups(factors.dissection, len(values), k, values.dtype), complement.without_known
+        problem = pencil, values, vectors, rhs, tolerance
+        return complement.solve_by_blocks(*problem, BLOCK, first, preconditioner, clean=clean(pencil, vectors))
 
     def _shifts(self, dissection: Dissection, values: Values, k: int) -> Shifts:
         """Return the shift of each group of the first k eigenvalues."""

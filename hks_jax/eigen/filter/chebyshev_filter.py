@@ -55,8 +55,8 @@ class ChebyshevFilter(Eigensolver[Pencil]):
 
     Attributes:
         tolerance: the relative residual at which a pair counts as converged.
-        block: the number of vectors filtered together, to which the size of the workspace is proportional. None means 16
-            on CPUs, and 32 on accelerators, which then launch fewer kernels.
+        block: the number of vectors filtered together, to which the size of the workspace is proportional. None means
+            16 on CPUs, and 32 on accelerators, which then launch fewer kernels.
         max_rounds: the maximal number of rounds on the finest grid.
         mesh: the devices, as a `jax.sharding.Mesh` with one axis. Each device filters some of the vectors, and stores
             all vectors on a part of the grid (docs/devices.md). None means one device.

@@ -10,17 +10,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from hks_jax.checks import require_count
 from hks_jax.compilation import jit_quickly
 from hks_jax.eigen.adjoints import complement
-from hks_jax.eigen.adjoints.complement import Adjoint, Columns, Rows, Scalar, Values, Vectors
+from hks_jax.eigen.adjoints.complement import Adjoint, Columns, OfRows, Rows, Scalar, Values, Vectors
 from hks_jax.eigen.filter.polynomial import Band, correction, upper_end
 from hks_jax.fem.nodal import nodal_pencil, to_columns, to_rows
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.stencil import StencilOperator
-from hks_jax.linear.conjugate_gradients import conjugate_gradients
+from hks_jax.linear.operators import OfColumns
 
 _GAIN = 20.0
 """The filter polynomial's value at λᵢ. A larger value needs fewer steps, but more products with K in each step."""
@@ -60,7 +59,6 @@ class FilteredAdjoint(Adjoint[Pencil]):
     def solve(self, prepared: Scalar, pencil: Pencil, values: Values, vectors: Vectors, rhs: Rows) -> Rows:
         """Solve (K − λᵢM) xᵢ = Q rhsᵢ with ΦᵀMxᵢ = 0; see `Adjoint.solve`."""
         high, space, nodal = prepared, pencil.space, nodal_pencil(pencil)
-        tolerance, beyond = complement.attainable(self.tolerance, rhs.dtype), complement.first_beyond(values)
         # The polynomial acts on D⁻¹K, where D is the lumped mass. On coarse grids, φᵀKφ / φᵀDφ is only a fraction of λ.
         mass = space.restrict(nodal.lumped)
         quotients = values / jax.lax.map(lambda phi: jnp.sum(mass * phi * phi), vectors, batch_size=self.block)
@@ -70,9 +68,8 @@ class FilteredAdjoint(Adjoint[Pencil]):
         nearest = (math.cosh(math.acosh(_GAIN) / _MOST_DEGREE) - 1) / 2
         quotients = jnp.minimum(quotients, band.low - nearest * (band.high - band.low))
         clean = complement.without_known(pencil, vectors)
-        stiffness, mass_product = pencil.stiffness.of_columns(), pencil.mass.of_columns()
 
-        def one_block(b: Array, wanted: Array, shifts: Array, references: Array) -> Columns:
+        def of_block(references: OfRows) -> OfColumns:
             degree = jnp.ceil(jnp.clip(band.degree_for(jnp.max(references), _GAIN), 2, _MOST_DEGREE)).astype(int)
 
             def precondition(r: Columns) -> Columns:
@@ -80,10 +77,8 @@ class FilteredAdjoint(Adjoint[Pencil]):
                 z = correction(nodal, band, columns.astype(jnp.float32), references, degree).astype(r.dtype)
                 return clean(-space.restrict(to_rows(z).reshape(-1, *nodal.shape)).T)
 
-            product = complement.definite_product(stiffness, mass_product, shifts, beyond)
-            return conjugate_gradients(product, precondition, b, wanted).converged
+            return precondition
 
-        k, one_group = len(rhs), np.zeros(1, int)
-        left, wanted = complement.projected(pencil, vectors, rhs, tolerance, complement.amplification(values, k))
-        rows = left, wanted, values[:k], quotients[:k]
-        return complement.solve_in_blocks(lambda _: one_block, self.block, one_group, *rows)
+        tolerance, one_group = complement.attainable(self.tolerance, rhs.dtype), np.zeros(1, int)
+        problem = pencil, values, vectors, rhs, tolerance
+        return complement.solve_by_blocks(*problem, self.block, one_group, lambda _: of_block, quotients[: len(rhs)])
