@@ -112,8 +112,8 @@ def without_effect(grid: Grid, boundary: BoundarySpec) -> str:
                 found[f"the {side} side of {name}"] = condition
     if not found:
         return ""
-    conditions = dict.fromkeys(found.values())
-    names = " and ".join(f'"{name}"' for name in conditions) + (" has" if len(conditions) == 1 else " have")
+    distinct = dict.fromkeys(found.values())
+    names = " and ".join(f'"{name}"' for name in distinct) + (" has" if len(distinct) == 1 else " have")
     where = "any side of the grid" if len(found) == 2 * grid.dimension else ", ".join(found)
     own = 'has the natural condition, unless you pass "dirichlet-rim" or "mean"' if rim == "neumann" else f'has "{rim}"'
     return f"boundary: {names} no effect at {where}, which the mask does not reach; the rim of the mask {own}"
