@@ -76,6 +76,12 @@ class Settings:
         given = {"metric": metric, "times": parse_times(chosen["times"]), **given}
         return cls(**{field.name: chosen[field.name] for field in fields(cls)} | given)
 
+    @property
+    def of_pairs(self) -> dict[str, Any]:
+        """The settings, except k, that determine eigenpairs."""
+        names = ("metric", "operator", "interpolation", "boundary", "components", "solver", "dtype")
+        return {name: getattr(self, name) for name in names}
+
     def field(self, grid: hj.Grid, tensors: Any) -> hj.TensorField:
         """Return the field of diffusion tensors with the metric or the operator of these settings."""
         of: Any = {"operator": self.operator, "interpolation": self.interpolation, "name": "tensors"}

@@ -88,15 +88,15 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         refuse(args, ("through",), "this option is for a volume; leave it out for a slice")
     noise = noise_of(domain, Reading.of(args), args.draws, progress)  # before the eigenpairs, because it may fail
     solved = solved or compute_pairs(domain, settings, progress, keep_spare=noise is not None)
-    kept = [args.output / PAIRS] * args.save_pairs
-    for path in kept:  # the eigenpairs are written first, because later steps may fail
-        with progress.stage("writing", str(path)):
+    kept = args.output / PAIRS
+    if args.save_pairs:  # before later steps, which may fail
+        with progress.stage("writing", str(kept)):
             for file in of_earlier(args.output, np.asarray(solved.pairs.eigenvalues), progress):
                 file.unlink(missing_ok=True)
-            write_pairs(path, solved, progress.warnings)
+            write_pairs(kept, solved, progress.warnings)
     result = signature_of(solved, noise, progress, args.checkpoint)
     from hks_jax.plot import signature_panels
 
     draw = partial(signature_panels, result, view=args.view, through=args.through, show_rim=args.show_rim)
     done = write_outputs(args.output, result, progress, draw, *domain.images, origin=domain.origin)
-    return done._replace(files=[*done.files, *kept])
+    return done._replace(files=[*done.files, *[kept] * args.save_pairs])

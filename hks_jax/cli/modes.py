@@ -24,7 +24,6 @@ examples:
 
 import argparse
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -109,7 +108,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
             shown[args.map.name] = np.where(np.isfinite(functions[0]), maps[0], np.nan)
     report = {
         "input": domain.about,
-        "settings": {name: asdict(solved.settings)[name] for name in _SETTINGS} | {"k": pairs.k},
+        "settings": {**solved.settings.of_pairs, "k": pairs.k},
         "eigenpairs": describe_pairs(pairs),
         "units": {"length": unit or None},
         "map": None if maps is None else {"source": str(args.map), "maps": len(maps)},
@@ -126,9 +125,6 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
             _tabulate(folder / "energies.tsv", known | means)
             _tabulate(folder / "coefficients.tsv", {f"map_{i + 1}": column for i, column in enumerate(coefficients)})
     return done
-
-
-_SETTINGS = ("metric", "operator", "interpolation", "boundary", "components", "solver", "dtype")
 
 
 def _means(found: ModeEnergies) -> dict[str, np.ndarray]:

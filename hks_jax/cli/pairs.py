@@ -3,7 +3,7 @@
 import json
 import zipfile
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,6 @@ from hks_jax.io.pairs import pairs_of, save_pairs
 from hks_jax.storage import load_npz
 
 _RECORD = "field_record"
-_SETTLED = ("metric", "operator", "interpolation", "boundary", "components", "solver", "dtype")
-"""Settings that the saved eigenpairs determine."""
 _ABOUT = ("order", "frame", "source", "digest", "notes", "repair")
 """The attributes of a volume that are saved as text."""
 
@@ -42,11 +40,11 @@ def write_pairs(path: Path, solved: Solved, warnings: Sequence[str], fingerprint
 
     The file also contains the suffix of image files (such as .nii.gz), the warnings, and the fingerprint of a subject.
     """
-    volume, settings = solved.domain.volume, asdict(solved.settings)
+    volume = solved.domain.volume
     assert volume is not None
     record = {name: getattr(volume, name) for name in _ABOUT}
     record |= {"image": solved.domain.images[0], "warnings": warnings, "fingerprint": fingerprint}
-    record["settings"] = {name: settings[name] for name in settings if name in _SETTLED}
+    record["settings"] = solved.settings.of_pairs
     save_pairs(path, solved.pairs, {"tensors": volume.tensors, **place_of(volume), _RECORD: json.dumps(plain(record))})
 
 

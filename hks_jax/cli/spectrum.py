@@ -14,7 +14,6 @@ examples:
 
 import argparse
 import csv
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -57,11 +56,9 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         "residuals": np.asarray(pairs.residuals),
         "weyl_counts": weyl_count(pairs, pairs.eigenvalues, domain.field),
     }
-    left_out = ("times", "normalisation", "method")
     report = {
         "input": domain.about,
-        "settings": {name: value for name, value in asdict(solved.settings).items() if name not in left_out}
-        | {"k": pairs.k},
+        "settings": {**solved.settings.of_pairs, "k": pairs.k},
         "eigenpairs": describe_pairs(pairs),
         "volume": np.asarray(pairs.pencil.volume).item(),
         "eigenvalues": columns["eigenvalues"].tolist(),

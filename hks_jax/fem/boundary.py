@@ -105,8 +105,8 @@ def without_effect(grid: Grid, boundary: BoundarySpec) -> str:
     found = {}
     for axis, (name, conditions) in enumerate(zip("xyz", axes, strict=False)):
         reached = [bool(np.take(grid.inside, index, axis).any()) for index in (0, -1)]
-        if conditions[0] == "periodic":  # needs both sides
-            reached = [all(reached)] * 2
+        if conditions[0] in ("periodic", "mirror"):  # always on both sides: the first needs both, the second one
+            reached = [all(reached) if conditions[0] == "periodic" else any(reached)] * 2
         for side, condition, here in zip(("low", "high"), conditions, reached, strict=True):
             if not here and condition not in ("neumann", rim):
                 found[f"the {side} side of {name}"] = condition

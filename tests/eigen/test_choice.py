@@ -48,10 +48,10 @@ SMALL = 100
 CASES = {
     "dense": (hks_of_grid, (9, 10), 5),
     "dense, many pairs": (hks_of_grid, (14, 15), 25),
-    "block-lanczos": (hks_of_grid, (14, 15), 5),
+    "block-lanczos": (hks_of_grid, (14, 15), 12),
     "block-lanczos, surface": (hks_of_surface, None, 5),
     "chebyshev-filter": (hks_of_grid, (8, 7, 6), 5),
-    "block-lanczos, 3d, many pairs": (hks_of_grid, (8, 7, 6), 20),
+    "block-lanczos, 3d, many pairs": (hks_of_grid, (8, 7, 6), 30),
 }
 
 
