@@ -62,7 +62,7 @@ def filter_round(shape: tuple[int, ...], devices: int, k: int, columns: int) -> 
     struct = partial(jax.ShapeDtypeStruct, dtype=jnp.float32)
     grid = hj.Grid(shape, 1 / (max(shape) - 1))
     pencil = jax.eval_shape(lambda T: hj.assemble(hj.TensorField(grid, T)), struct((*shape, 3, 3)))
-    plan = hj.ChebyshevFilter(block=columns, mesh=mesh).plan(k, pencil.space)
+    plan = hj.ChebyshevFilter(block=columns, mesh=mesh).plan(k, pencil)
     parts = jax.sharding.NamedSharding(slabs.mesh, jax.sharding.PartitionSpec(None, slabs.name))
     whole = jax.sharding.NamedSharding(slabs.mesh, jax.sharding.PartitionSpec())
     values, count = struct((plan.size,)), jax.ShapeDtypeStruct((), int, sharding=whole)

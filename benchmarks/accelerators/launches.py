@@ -149,7 +149,7 @@ def whole(rows: list[dict], n: int, k: int) -> Iterator[dict]:
 def chebyshev_filter(n: int, k: int) -> Iterator[Task]:
     """Yield a round of the filter on n³ nodes."""
     pencil = shapes_of(n, 3, np.float32)
-    plan = hj.ChebyshevFilter().plan(k, pencil.space)
+    plan = hj.ChebyshevFilter().plan(k, pencil)
     nodal = jax.eval_shape(nodal_pencil, pencil)
 
     def array(*shape: int, dtype: type = np.float32) -> jax.ShapeDtypeStruct:

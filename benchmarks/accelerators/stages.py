@@ -68,7 +68,7 @@ def stages(n: int, k: int) -> Iterator[Stage]:
     nodal = jax.eval_shape(nodal_pencil, pencil)
     matrices = pencil.stiffness, pencil.mass
     own = tensors, pencil.metric, pencil.null_space, nodal.lumped, nodal.free, nodal.domain  # beside K and M
-    one, plan = array(), hj.ChebyshevFilter().plan(k + 1, pencil.space)
+    one, plan = array(), hj.ChebyshevFilter().plan(k + 1, pencil)
     coarse = jax.eval_shape(coarsen, nodal)
     fine, next_to = GridFilter(nodal, one, plan), GridFilter(coarse, one, plan)
     state = state_of(plan, nodes)

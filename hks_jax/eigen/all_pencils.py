@@ -67,6 +67,15 @@ def _starts(start: Eigenpairs | None, pencil: AnyPencil) -> Sequence[PencilEigen
     expected, got = ([each.space.node_shape for each in of] for of in (pencil.parts, problems))
     if got != expected:
         raise ValueError(f"start: got pairs on nodes of the shapes {got}; expected {expected}, one for each problem")
+    # Where all given vectors are zero, such as on another component, a filter would keep them zero.
+    others = [
+        int((part.space.free != each.space.free).sum()) for part, each in zip(pencil.parts, problems, strict=True)
+    ]
+    if any(others):
+        raise ValueError(
+            f"start: got pairs of another mask or boundary condition, which differs at {max(others)} nodes; expected "
+            "pairs of the same ones"
+        )
     return problems
 
 

@@ -39,7 +39,7 @@ class FunctionSpace(ByKey):
     boundary: tuple[Sides, ...]  # the conditions of each axis and of the rim of a mask; for a mesh one pair
     n_components: int  # the number of connected components of the domain
     elements: Bool[np.ndarray, "*elements"]  # the elements in the domain; a grid axis has n − 1 or, if periodic, n
-    _labels: Int[np.ndarray, "*node_shape"]
+    labels: Int[np.ndarray, "*node_shape"]  # the connected component of each node of the domain
 
     def __repr__(self) -> str:
         """Return one line: the degrees of freedom, the nodes and the boundary."""
@@ -74,8 +74,8 @@ class FunctionSpace(ByKey):
 
         The null vectors are 1 on one connected component of the domain without Dirichlet nodes, and 0 elsewhere.
         """
-        pinned = np.unique(self._labels[self.domain & ~self.free])
-        labels = self._labels.ravel()[self._free_indices]
+        pinned = np.unique(self.labels[self.domain & ~self.free])
+        labels = self.labels.ravel()[self._free_indices]
         kept = np.setdiff1d(np.unique(labels), pinned)
         return np.where(np.isin(labels, kept), np.searchsorted(kept, labels), -1)
 
@@ -157,7 +157,7 @@ class GridSpace(FunctionSpace):
                 f"boundary: every node of the domain is on a Dirichlet side or rim (grid shape {grid.shape}); use a "
                 "finer grid or a thicker mask"
             )
-        self._labels, self.n_components = label_nodes(grid.inside, self.periodic)
+        self.labels, self.n_components = label_nodes(grid.inside, self.periodic)
         self._key = (self.grid, boundary)
 
     @cached_property
@@ -228,7 +228,7 @@ class MeshSpace(FunctionSpace):
         self.free = self.domain & ~rim if condition == "dirichlet" else self.domain
         if not self.free.any():
             raise ValueError("boundary: every vertex is on the mesh's boundary, and so none is free. Refine the mesh")
-        self._labels, self._key = labels, (triangulation, condition, degree)
+        self.labels, self._key = labels, (triangulation, condition, degree)
 
 
 @jax.tree_util.register_static
@@ -238,8 +238,8 @@ class VectorSpace(FunctionSpace):
     def __init__(self, base: "GridSpace | MeshSpace", components: int) -> None:
         self.base, self.components = base, components
         self.node_shape, self.dimension = (*base.node_shape, components), base.dimension
-        self.domain, self.free, self._labels = (
-            np.repeat(x[..., None], components, axis=-1) for x in (base.domain, base.free, base._labels)
+        self.domain, self.free, self.labels = (
+            np.repeat(x[..., None], components, axis=-1) for x in (base.domain, base.free, base.labels)
         )
         self.boundary, self.n_components, self.elements = base.boundary, base.n_components, base.elements
         self.cells = (base.cells[..., None] * components + np.arange(components)).reshape(len(base.cells), -1)
@@ -255,7 +255,7 @@ class MatrixSpace(FunctionSpace):
     def __init__(self, shape: tuple[int, ...], dimension: int | None = None) -> None:
         self.node_shape, self.dimension, self.boundary = shape, dimension, ()
         self.domain = self.free = np.ones(shape, bool)
-        self.n_components, self._labels = 1, np.zeros(shape, int)
+        self.n_components, self.labels = 1, np.zeros(shape, int)
         self._key = (shape, dimension)
 
 

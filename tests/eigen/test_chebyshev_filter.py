@@ -193,10 +193,56 @@ def test_pairs_equal_the_dense_ones(name):
     assert sum("of 25 pairs" in text for text in rounds) <= (5 if name == "2d" else 8)
 
 
+def with_island(n, side):
+    """Return a field on an ellipse, and on a square of nodes that coarse grids lack."""
+    x, y = np.indices((n, n)) / n
+    mask = ((x - 0.5) / 0.42) ** 2 + ((y - 0.42) / 0.32) ** 2 < 1
+    mask[-11 : side - 11, -11 : side - 11] = True
+    tensors = np.broadcast_to(np.diag([1.0, 1.3]), (n, n, 2, 2))
+    return hj.TensorField(hj.Grid((n, n), 1 / n, mask=mask, components="all"), tensors)
+
+
+def test_coarse_grids_have_nodes_in_every_component():
+    for side, shapes in ((0, [120, 60, 30]), (3, [120, 60])):
+        pencil = hj.assemble(with_island(120, side))
+        grids = chebyshev_filter._nested(pencil, hj.ChebyshevFilter(block=8).plan(7, pencil))
+        assert [grid.shape[0] for grid in grids] == shapes
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fields", [{}, {"potential": 3.0}], ids=["null vectors", "potential"])
+def test_no_eigenvalue_of_a_small_component_is_missed(fields):
+    pencil = hj.assemble(with_island(120, 3), **fields)
+    pairs = hj.eigenpairs(pencil, 6, solver=hj.ChebyshevFilter(block=8))
+    np.testing.assert_allclose(
+        pairs.eigenvalues, hj.eigenpairs(pencil, 6, solver="shift-invert").eigenvalues, atol=1e-9
+    )
+
+
+@pytest.mark.slow
+def test_residuals_are_relative_to_the_first_positive_eigenvalue():
+    """Two components have two zero eigenvalues; beside a Dirichlet side there is none, and the first may be small."""
+    mask = np.ones((48, 48), bool)
+    mask[23] = False
+    halves = hj.TensorField(
+        hj.Grid(mask.shape, 1 / 48, mask=mask, components="all"), np.tile(np.eye(2), (48, 48, 1, 1))
+    )
+    door = np.tile(np.eye(2), (48, 48, 1, 1))
+    door[3:5] *= 1e-4
+    room = hj.TensorField.from_diffusion(hj.Grid((48, 48), 1 / 48), door, operator="fick")
+    for field, boundary in ((halves, "neumann"), (room, (("dirichlet", "neumann"), "neumann"))):
+        told = []
+        pairs = hj.eigenpairs(field, 12, boundary, hj.ChebyshevFilter(block=8), progress=told.append)
+        assert pairs.converged.all()
+        assert sum("of 13 pairs" in text for text in told) <= 6
+    pairs = hj.eigenpairs(halves, 2, solver=hj.ChebyshevFilter(block=8))  # all pairs are null vectors
+    assert pairs.converged.all()
+
+
 def test_a_filter_changes_only_blocks_with_a_vector_that_is_not_accurate():
     pencil = problem("2d")
     nodal = nodal_pencil(pencil)
-    grid = GridFilter(nodal, upper_end(nodal), hj.ChebyshevFilter(block=8).plan(8, pencil.space))
+    grid = GridFilter(nodal, upper_end(nodal), hj.ChebyshevFilter(block=8).plan(8, pencil))
     state = grid.from_random(pencil.volume)
     chosen = grid.choose(jnp.zeros(()), state)
     for allowed, changed in ((0.9, False), (1.1, True)):

@@ -105,10 +105,11 @@ class ChebyshevFilter(Eigensolver[Pencil]):
         moved, origin = from_lower_bound(pencil)
         assert isinstance(moved, Pencil)
         assert isinstance(moved.space, GridSpace)
-        plan = self.plan(k, moved.space)
+        plan = self.plan(k, pencil)
         compute = _compiled if is_traced(moved) else _iterate
         start = None if start is None or len(start) < plan.size else start[: plan.size]
-        values, vectors = compute(moved, plan, self.max_rounds, report, start, plan.size if self.keep_spare else k)
+        rounds = 0 if plan.n_null >= k else self.max_rounds  # the caller knows null vectors
+        values, vectors = compute(moved, plan, rounds, report, start, plan.size if self.keep_spare else k)
         values = values if pencil.null_space is not None else values + origin
         return values, vectors, jnp.asarray(jnp.nan, values.dtype)
 
@@ -124,12 +125,13 @@ class ChebyshevFilter(Eigensolver[Pencil]):
     def _together(self) -> int:
         return (32 if accelerators.at_hand() else 16) if self.block is None else self.block
 
-    def plan(self, k: int, space: GridSpace) -> FilterPlan:
+    def plan(self, k: int, pencil: Pencil) -> FilterPlan:
         """Return the number of vectors, and the other static settings of the subspace iteration, for k eigenpairs."""
         mesh, block = None if self.mesh is None else checked_mesh(self.mesh), self._together
         multiple = block if mesh is None else block * mesh.size
         size = math.ceil((k + max(8, _SPARE * k)) / multiple) * multiple
-        return FilterPlan(k, size, block, space.n_null, self.tolerance, mesh)
+        zeros = 1 if pencil.null_space is None else min(pencil.n_null, size - 1)
+        return FilterPlan(k, size, block, zeros, self.tolerance, mesh)
 
 
 def _iterate(
@@ -240,11 +242,16 @@ class Pace:
 
 
 def _nested(pencil: Pencil, plan: FilterPlan) -> list[NodalPencil]:
-    """Return the pencils of all grids, from the finest to the coarsest."""
-    grids, free = [nodal_pencil(pencil)], pencil.space.free
+    """Return the pencils of all grids, from the finest to the coarsest, on which no component of the domain is lost.
+
+    All vectors would be zero on a component without a node on a coarse grid, and filters would keep them zero there.
+    """
+    grids, components = [nodal_pencil(pencil)], np.where(pencil.space.free, pencil.space.labels, -1)
+    every = np.unique(components)
     while True:
-        free = free[(slice(None, None, 2),) * free.ndim]
-        if min(grids[-1].shape) < _LEAST_NODES or free.sum() < _ROOM * plan.size:
+        components = components[(slice(None, None, 2),) * components.ndim]
+        lost = np.setdiff1d(every, components).max(initial=-1) >= 0
+        if lost or min(grids[-1].shape) < _LEAST_NODES or (components >= 0).sum() < _ROOM * plan.size:
             return grids
         grids.append(coarsen(grids[-1]))
 
