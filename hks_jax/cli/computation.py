@@ -160,7 +160,7 @@ def result_of(solved: Solved, progress: Progress) -> Result:
 
 def _influence(pairs: hj.Eigenpairs, times: tuple[float, ...]) -> np.ndarray | None:
     """Return the influence of the boundary (n_times, *shape), or None if it is not known."""
-    if not is_known(pairs.pencil):
+    if not is_known(pairs):
         return None
     t = times_of(pairs, times)
     found, early = np.array(influence_of(pairs, t)), np.asarray(truncated_share(pairs, t)[0]) > EARLY

@@ -344,11 +344,8 @@ def assemble_mesh(
         volumes = metric_density @ weights
     if operator.fick:
         ratio = _mean_over_cells(space, density**2 / metric_density @ weights, density @ weights)
-    # The error of P1 elements is estimated from the lengths of edges. No error estimate is known for P2 elements.
-    sampled = None
-    if space.degree == 1:
-        own_metric, of_space = jax.lax.stop_gradient((mesh.metric, mesh.metric_of_space))
-        sampled = SampledMetric(own_metric, None, of_space=of_space)
+    own_metric, of_space = jax.lax.stop_gradient((mesh.metric, mesh.metric_of_space))
+    sampled = SampledMetric(own_metric, None, of_space=of_space)
     matrices = gathered(functions, stiffness), gathered(functions, mass)
     return assembled(*matrices, lumped, sampled, jnp.sum(volumes), ratio, functions, operator, fields)
 

@@ -74,7 +74,7 @@ class Pencil(SymmetricPencil):
     @property
     def resolution(self) -> Resolution | None:
         """The effect of the node spacing on signatures, for error estimates; None if it is not known."""
-        if self.metric is None:
+        if self.metric is None or self.space.degree == 2:  # no error estimate is known for P2 elements
             return None
         return resolution_of(
             self.metric, self.space, isinstance(self.mass, DiagonalOperator), self.row_sums is not None

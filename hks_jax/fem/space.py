@@ -34,6 +34,7 @@ class FunctionSpace(ByKey):
 
     node_shape: tuple[int, ...]  # the shape of a nodal array: the grid's shape, or (V,)
     dimension: int  # the dimension of the manifold
+    degree: int = 1  # the degree of the finite elements
     domain: Bool[np.ndarray, "*node_shape"]  # the nodes of the domain; results are NaN elsewhere
     free: Bool[np.ndarray, "*node_shape"]  # the nodes that carry a degree of freedom; Dirichlet nodes are not free
     boundary: tuple[Sides, ...]  # the conditions of each axis and of the rim of a mask; for a mesh one pair
@@ -237,7 +238,7 @@ class VectorSpace(FunctionSpace):
 
     def __init__(self, base: "GridSpace | MeshSpace", components: int) -> None:
         self.base, self.components = base, components
-        self.node_shape, self.dimension = (*base.node_shape, components), base.dimension
+        self.node_shape, self.dimension, self.degree = (*base.node_shape, components), base.dimension, base.degree
         self.domain, self.free, self.labels = (
             np.repeat(x[..., None], components, axis=-1) for x in (base.domain, base.free, base.labels)
         )

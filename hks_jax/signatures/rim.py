@@ -95,8 +95,11 @@ def is_estimated(pairs: Eigenpairs) -> bool:
 
 def influence_of(pairs: Eigenpairs, times: Float[Array, " m"]) -> Float[Array, "m *shape"]:
     """Return `boundary_influence` of eigenpairs without warnings of unresolved times."""
-    if not is_known(pairs.pencil):
-        raise ValueError("domain: got eigenpairs of other matrices; expected eigenpairs of a field or a mesh")
+    if not is_known(pairs):
+        raise ValueError(
+            "domain: got eigenpairs of other matrices or, of one problem, with a potential; expected eigenpairs of a "
+            'field or a mesh. With a potential, compute them with the boundary "mean"'
+        )
     if rim_of(pairs.pencil).any() and not is_estimated(pairs):
         return _share(*(spectral_diagonal(pairs.problems[i], Heat(times)) for i in (0, -1)))
     return estimate_of(pairs, times)
@@ -124,9 +127,14 @@ def rim_of(pencil: AnyPencil) -> Bool[np.ndarray, "*shape"]:
     return boundary_nodes(space.elements, space.periodic)
 
 
-def is_known(pencil: AnyPencil) -> bool:
-    """Return whether `boundary_influence` can tell the influence of the boundary on eigenpairs of a pencil."""
-    return isinstance(pencil.space, GridSpace | MeshSpace) and pencil.parts[0].metric is not None
+def is_known(pairs: Eigenpairs) -> bool:
+    """Return whether `boundary_influence` can tell the influence of the boundary on eigenpairs.
+
+    The estimate is for Brownian motion without a potential, so with a potential the null space is unknown.
+    """
+    first = pairs.problems[0].pencil
+    of_domain = isinstance(first.space, GridSpace | MeshSpace) and first.metric is not None
+    return of_domain and (first.null_space is not None or not is_estimated(pairs))
 
 
 # From the distance d to a straight side, the first passage time τ has E exp(−4τ/t) = exp(−2d/√t), and the function
@@ -177,7 +185,7 @@ def half_free(pairs: Eigenpairs, first: Any, last: Any) -> Float[Array, ""]:
 
     The result is `last` if the influence of the boundary is not known.
     """
-    if not is_known(pairs.pencil) or not rim_of(pairs.pencil).any():
+    if not is_known(pairs) or not rim_of(pairs.pencil).any():
         return jnp.asarray(last)
     times = _candidates(first, last)
     return _time_of_half(jax.lax.stop_gradient(free_share(influence_of(pairs, times), pairs.space)), times)

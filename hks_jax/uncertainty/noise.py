@@ -68,6 +68,8 @@ class TensorNoise(eqx.Module):
             raise ValueError(f"covariance: got shape {shape}; expected {(*grid.shape, *shape[-2:])} for this grid")
         if self.correlation and grid is None:
             raise ValueError("correlation: got a length but no grid; expected both. Pass the grid of the tensors")
+        if self.correlation and self.modes is not None:
+            raise ValueError("correlation: got a length beside modes, which have a correlation. Leave one of them out")
         if not is_traced(self.covariance):
             _check_semidefinite(np.asarray(self.covariance))
 
@@ -112,7 +114,7 @@ class TensorNoise(eqx.Module):
         values = real_array("tensors", tensors)
         rows, columns = np.tril_indices(values.shape[-1])
         isotropic = np.diag(np.where(rows == columns, level**2, level**2 / 2))
-        return cls(_scaled(isotropic, values), grid, correlation)
+        return cls(_scaled(isotropic, values, grid), grid, correlation)
 
     @classmethod
     def from_scans(cls, first: Any, second: Any, grid: Grid) -> "TensorNoise":
@@ -152,7 +154,7 @@ class TensorNoise(eqx.Module):
             u, v = (np.moveaxis(parts, axis, 0)[part][x & y] for part in (slice(1, None), slice(None, -1)))
             shared = float(np.sum(u * v) / np.sqrt(np.sum(u * u) * np.sum(v * v))) if u.size else 0.0
             widths.append(h / (2 * math.sqrt(-math.log(min(shared, 0.99)))) if shared > 0.05 else 0.0)
-        return cls(_scaled(relative, (a + b) / 2), grid, float(np.mean(widths)))
+        return cls(_scaled(relative, (a + b) / 2, grid), grid, float(np.mean(widths)))
 
     @classmethod
     def from_roughness(cls, tensors: Any, grid: Grid) -> "TensorNoise":
@@ -214,9 +216,14 @@ class TensorNoise(eqx.Module):
         return parts[..., np.maximum(which, which.T)]
 
 
-def _scaled(relative: Float[np.ndarray, "m m"], tensors: Any) -> Float[Array, "*shape m m"]:
-    """Return a covariance relative to the squared mean eigenvalue of the tensors (*shape, d, d) in absolute units."""
+def _scaled(relative: Float[np.ndarray, "m m"], tensors: Any, grid: Grid | None) -> Float[Array, "*shape m m"]:
+    """Return a covariance relative to the squared mean eigenvalue of the tensors (*shape, d, d) in absolute units.
+
+    The covariance is 0 outside the grid's mask, where tensors may be NaN.
+    """
     squared = jnp.square(jnp.trace(jnp.asarray(tensors), axis1=-2, axis2=-1) / np.shape(tensors)[-1])
+    if grid is not None and grid.shape == squared.shape:
+        squared = jnp.where(grid.inside, squared, 0)
     return jnp.multiply.outer(squared, jnp.asarray(relative, squared.dtype))
 
 

@@ -124,3 +124,14 @@ def test_a_basis_that_is_too_small_grows_unless_the_user_set_it(rng):
 def test_numbers_that_overflow_find_nothing():
     with pytest.warns(hj.AccuracyWarning, match="4 were not found"):
         assert np.isnan(hj.eigsh(path(np.full(59, 1e-160)).tocsr(), k=4, solver="shift-invert").eigenvalues).all()
+
+
+def test_pairs_of_two_rooms_with_a_narrow_neck_converge():
+    """The first positive eigenvalue is a hundredth of the mean gap, to which its residual must not be relative."""
+    x, y = np.indices((60, 150))
+    rooms = (np.hypot(x - 30, y - 29) < 28) | (np.hypot(x - 30, y - 125) < 28)
+    neck = (x >= 30) & (x < 32) & (y > 29) & (y < 125)
+    grid = hj.Grid((60, 150), 0.01, mask=rooms | neck, components="largest")
+    pairs = hj.eigenpairs(hj.TensorField(grid, np.tile(np.eye(2), (60, 150, 1, 1))), 60, solver="shift-invert")
+    assert pairs.eigenvalues[1] < 0.02 * pairs.eigenvalues[-1] / 60
+    assert pairs.converged.all()

@@ -244,6 +244,17 @@ def test_the_energy_of_a_plane_wave_is_at_its_wavelength_in_mm(diffusivity):
     np.testing.assert_allclose(given.wavelength[1:], 2 * found.wavelength[1:])
 
 
+@pytest.mark.parametrize("degree", [1, 2])
+def test_wavelengths_on_a_mesh_are_lengths_whatever_the_unit_of_tensors(degree):
+    sphere = hj.examples.sphere_mesh(2)
+    tensors = np.tile(1e-3 * np.eye(3), (len(sphere.vertices), 1, 1))
+    mesh = hj.SurfaceMesh.from_tensors(sphere.vertices, sphere.faces, tensors, metric="inverse")
+    pairs = hj.eigenpairs(hj.assemble(mesh, degree=degree), 4)
+    found = hj.energy(pairs, np.ones(pairs.space.node_shape))
+    exact = hj.eigenpairs(hj.assemble(sphere, degree=degree), 4).eigenvalues  # of −Δ in space
+    np.testing.assert_allclose(found.wavelength[1:], 2 * np.pi / np.sqrt(exact[1:]), rtol=1e-8)
+
+
 @pytest.mark.parametrize("solid", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_wavelengths_on_meshes_are_in_mm_whatever_the_tensors(solid):
     """The first wave along a bar of 24 mm has a wavelength of 48 mm; a tensor across a surface does not matter."""

@@ -100,6 +100,14 @@ def test_default_times_are_the_same_when_traced(strip):
 def test_a_boundary_that_is_not_known_is_refused_and_does_not_end_times(strip):
     pencil = hj.assemble(strip, STRIP[0])
     pairs = hj.eigenpairs(hj.sparse_pencil(pencil.stiffness.to_scipy(), pencil.mass.to_scipy(), dimension=2), 12)
-    with pytest.raises(ValueError, match="eigenpairs of other matrices"):
-        influence_of(pairs, jnp.array([0.1]))
-    assert float(half_free(pairs, 0.1, 5.0)) == 5.0
+    potential = hj.eigenpairs(hj.assemble(strip, STRIP[0], potential=50.0), 12)
+    for each in (pairs, potential):
+        with pytest.raises(ValueError, match="eigenpairs of other matrices or, of one problem, with a potential"):
+            influence_of(each, jnp.array([0.1]))
+        assert float(half_free(each, 0.1, 5.0)) == 5.0
+
+
+def test_a_constant_potential_does_not_change_the_influence_of_the_boundary(strip):
+    plain, potential = (hj.eigenpairs(hj.assemble(strip, "mean", **own), 40) for own in ({}, {"potential": 50.0}))
+    t = jnp.array([0.2, 0.5])
+    np.testing.assert_allclose(influence_of(potential, t), influence_of(plain, t), atol=1e-9)

@@ -410,6 +410,23 @@ def test_roughness_tells_the_level_on_smooth_fields(rng):
     assert abs(np.median(ratio) - 1) < 0.1
 
 
+def test_noise_needs_no_tensors_outside_the_mask(rng):
+    inside = np.ones((9, 8), bool)
+    inside[:3, :4] = False
+    grid, first, second = hj.Grid((9, 8), mask=inside), random_spd(rng, (9, 8)), random_spd(rng, (9, 8))
+    for of in (
+        lambda D: hj.TensorNoise.relative(D(first), 0.1, grid),
+        lambda D: hj.TensorNoise.from_scans(D(first), D(second), grid),
+        lambda D: hj.TensorNoise.from_roughness(D(first), grid),
+    ):
+        zero, nan = (
+            of(lambda x, value=value: np.where(inside[..., None, None], x, value)).covariance for value in (0.0, np.nan)
+        )
+        np.testing.assert_array_equal(nan, zero)
+    with pytest.raises(ValueError, match="correlation: got a length beside modes"):
+        hj.TensorNoise(np.tile(np.eye(3), (9, 8, 1, 1)), grid, 2.0, modes=jnp.ones((9, 8, 4, 3)))
+
+
 @pytest.mark.parametrize("d", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_smoothing_is_log_euclidean_and_keeps_to_the_mask(rng, d):
     shape = (7, 6, 5)[:d]

@@ -38,7 +38,9 @@ _FEW = 12
 _TRIES = 3
 """The maximal number of shifts that are tried within the spectrum."""
 _POOR = 1e-9
-"""The relative residual up to which eigenvectors need no further solve."""
+"""The residual, relative to the eigenvalue or the first positive one, up to which a vector needs no further solve."""
+_SOLVES = 2
+"""The maximal number of further solves."""
 _ACCURATE = 1e-9
 """The largest convergence rate of iterative refinement with a factorisation within the spectrum."""
 
@@ -171,7 +173,8 @@ class ShiftInvert(Eigensolver[Pencil]):
                     break
             missing = negative - int((values < below).sum())
             if not sound or missing <= 0:
-                return _ordered(*_refined(K, M, scales.below, vectors), below if sound and missing == 0 else np.nan)
+                values, vectors = _refined(K, M, scales.below, rounding, vectors)
+                return _ordered(values, vectors, below if sound and missing == 0 else np.nan)
             report(f"{missing} eigenpairs are missing: searching again")
         return nothing
 
@@ -212,14 +215,21 @@ def _shifted(K: csc_matrix, M: csc_matrix, k: int, scales: _Scales) -> tuple[flo
 # relative to the other components. These errors have high frequencies, so that residuals may be large relative to low
 # eigenvalues. A solve with K + sM divides an error along φₗ by (λₗ + s)/(λᵢ + s). Rayleigh quotients are accurate in
 # any case, because errors of eigenvectors enter them squared.
-def _refined(K: csc_matrix, M: csc_matrix, s: float, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return eigenvalues, and the M-orthonormal eigenvectors after a further solve for those with large residuals."""
-    force, image = K @ vectors, M @ vectors
-    values = np.sum(vectors * force, axis=0)
-    residuals = np.linalg.norm(force - image * values, axis=0) / np.linalg.norm(image, axis=0)
-    large = residuals > _POOR * np.maximum(np.abs(values), np.abs(values).max() / values.size)
-    if large.any():
-        better = factorise_on_host(K + s * M).solve(image[:, large]) * (values[large] + s)
+def _refined(
+    K: csc_matrix, M: csc_matrix, s: float, rounding: float, vectors: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return eigenvalues, and the M-orthonormal eigenvectors after further solves for those with large residuals."""
+    factor: SuperLU | None = None
+    for _ in range(_SOLVES):
+        force, image = K @ vectors, M @ vectors
+        values = np.sum(vectors * force, axis=0)
+        residuals, sizes = np.linalg.norm(force - image * values, axis=0), np.abs(values)
+        first = sizes[sizes > rounding].min(initial=sizes.max() / sizes.size)
+        large = residuals > _POOR * np.maximum(sizes, first) * np.linalg.norm(image, axis=0)
+        if not large.any():
+            break
+        factor = factorise_on_host(K + s * M) if factor is None else factor
+        better = factor.solve(image[:, large]) * (values[large] + s)
         better -= vectors[:, ~large] @ (image[:, ~large].T @ better)
         values[large], mix = eigh(better.T @ (K @ better), better.T @ (M @ better))
         vectors[:, large] = better @ mix
