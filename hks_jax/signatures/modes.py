@@ -135,7 +135,8 @@ def _sum(coefficients: Any, kept: Any, modes: Any) -> Any:
 def energy(pairs: Eigenpairs, f: Any, diffusivity: Any = None) -> ModeEnergies:
     """Return the coefficients of maps and their energies ∫(cᵢφᵢ)², the modes' wavelengths, and the variance explained.
 
-    The energies and the last residual add up to ∫f² (Parseval), if all nodes are measured.
+    The energies and the last residual add up to ∫f² (Parseval), if all nodes are measured; with the quadrature
+    ``"cancelling"`` up to errors of fourth order.
 
     Args:
         pairs: the result of `eigenpairs`.

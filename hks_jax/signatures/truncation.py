@@ -188,9 +188,10 @@ def _of_nodes(resolution: Resolution, free: Any, at: Any, moments: list[Any], di
         nodal, free = tuple(xp.where(free, x, 0).ravel() for x in nodal), free.ravel()
     bias, lasting = _resolution_bias(resolution, nodal, free, at, moments, dimension)
     coarse = xp.sum(bias > BIAS_LIMIT, axis=1, dtype=at.dtype) / xp.sum(free, dtype=at.dtype)
-    # At small t, the part x/(1 + x) that decreases has x = (dispersion/t)^order.
-    largest = xp.max(nodal[0])
-    typical = largest * median_of_shares(nodal[0][None] / xp.where(largest > 0, largest, 1), free)[0]
+    # At small t, the part x/(1 + x) that decreases has x = |dispersion/t|^order.
+    dispersion = xp.abs(nodal[0])
+    largest = xp.max(dispersion)
+    typical = largest * median_of_shares(dispersion[None] / xp.where(largest > 0, largest, 1), free)[0]
     resolved = typical * _odds(BIAS_LIMIT) ** (-1 / resolution.order)
     medians = (median_of_shares(each, free) for each in (bias, lasting))
     return *medians, coarse, resolved
