@@ -82,7 +82,7 @@ def _solved_jvp(
     pencil = replace(pencil, metric=None, density=None)
     on_failure: OnFailure = "error" if throw else "nothing" if is_traced(primals) else "warning"
     constants, settings = _Constants(prepared, pencil, origin, from_origin, vectors, functions), (adjoint, on_failure)
-    tangents = linear_program(_tangents, settings, (constants,), change, (eigenvalues, functions), _by_numpy)
+    tangents = linear_program(_tangents, settings, (constants,), change, (eigenvalues, functions), _host_map)
     others = following if extra else jnp.full_like(following, jnp.inf), complete_below, spare
     return (eigenvalues, functions, *others), (*tangents, *jax.tree.map(jnp.zeros_like, others))
 
@@ -129,7 +129,7 @@ def _solves(pencil: SymmetricPencil, k: int, p: int) -> bool:
     return p < pencil.size and pencil.n_fixed < k
 
 
-def _by_numpy(adjoint: Adjoint, on_failure: OnFailure, constants: _Constants) -> HostMap | None:
+def _host_map(adjoint: Adjoint, on_failure: OnFailure, constants: _Constants) -> HostMap | None:
     """Return `_tangents` by NumPy."""
     prepared, pencil, origin, values, vectors, functions = constants
     if vectors.size > _ON_HOST:

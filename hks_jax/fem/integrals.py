@@ -114,14 +114,14 @@ def _grid_integrals_jvp(settings: Settings, primals: tuple, changes: tuple) -> t
     if is_traced(primals):
         return jax.jvp(partial(_compiled_integrals, settings, primals[0]), primals[1:], change)
     value = _grid_integrals(settings, *primals)
-    return value, linear_program(_change_of_integrals, (settings,), primals, change, value, _host_derivative)
+    return value, linear_program(_change_of_integrals, (settings,), primals, change, value, _host_map)
 
 
 def _change_of_integrals(settings: Settings, geometry: Geometry, tensors: Array, fields: Any, change: Any) -> Integrals:
     return jax.jvp(partial(_compiled_integrals, settings, geometry), (tensors, fields), change)[1]
 
 
-def _host_derivative(settings: Settings, geometry: Geometry, tensors: Array, fields: Any) -> HostMap | None:
+def _host_map(settings: Settings, geometry: Geometry, tensors: Array, fields: Any) -> HostMap | None:
     host = host_integrals(settings, geometry, tensors, fields)
     return None if host is None else host.derivative
 

@@ -5,7 +5,7 @@ For example, the derivative of r = 1/a for each entry of an array is the linear 
     def change_of_reciprocals(r, da):
         return -r * da * r
 
-    def by_numpy(r):
+    def host_map(r):
         r = np.asarray(r)
         return HostMap(lambda da: -r * np.asarray(da) * r, lambda like, y: -r * y * r)
 
@@ -16,7 +16,7 @@ For example, the derivative of r = 1/a for each entry of an array is the linear 
     @reciprocals.defjvp
     def _reciprocals_jvp(primals, tangents):
         r = reciprocals(*primals)
-        return r, linear_program(change_of_reciprocals, (), (r,), *tangents, r, by_numpy)
+        return r, linear_program(change_of_reciprocals, (), (r,), *tangents, r, host_map)
 
 Forward mode calls the map, and reverse mode its transpose.
 """

@@ -137,7 +137,7 @@ class SquaredDistances(_FromSources):
         return jnp.moveaxis(readings, 0, 1)
 
 
-def by_numpy(
+def host_map(
     fixed: bool,
     contraction: Contraction,
     filters: Filter,

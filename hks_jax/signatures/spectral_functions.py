@@ -19,7 +19,7 @@ from hks_jax.fem.space import FunctionSpace
 from hks_jax.linear.linear_map import first_order_only, instantiated, is_constant
 from hks_jax.linear.linear_program import linear_program
 from hks_jax.linear.products import row_blocks
-from hks_jax.signatures.contractions import Applied, Columns, Contraction, Diagonal, SquaredDistances, by_numpy
+from hks_jax.signatures.contractions import Applied, Columns, Contraction, Diagonal, SquaredDistances, host_map
 from hks_jax.signatures.filters import Custom, Derivative, Filter, mixing, weights_of
 
 _FILTERS = 8
@@ -129,7 +129,7 @@ def _kernel_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
         pencil, moved = pairs.pencil, instantiated((d_pairs.frame, d_pairs.pencil))
         reader = None if pencil.row_sums is None else pencil
         known = contraction, filters, pairs.eigenvalues, pairs.frame, pairs.kept, reader
-        terms.append(linear_program(_tangent, (pencil.n_fixed > 0,), known, moved, value, by_numpy))
+        terms.append(linear_program(_tangent, (pencil.n_fixed > 0,), known, moved, value, host_map))
     elif not is_constant((d_pairs.eigenvalues, d_pairs.frame)):  # the arrays themselves change, so JAX's rules apply
         pairs = first_order_only(pairs)
         moved = jax.jvp(
