@@ -185,7 +185,7 @@ def _checked_mask(mask: Any, shape: tuple[int, ...], components: str) -> np.ndar
             raise ValueError(
                 f"mask: got {count} connected components ({largest} nodes); expected one component. "
                 f"Pass {argument('components', 'largest')} to keep the largest one, or {argument('components', 'all')} "
-                "to keep all"
+                "to keep all, also where a periodic axis joins them"
             )
         array = labels == 1 + int(np.argmax(sizes))
     return array

@@ -61,7 +61,7 @@ def weyl_count(
     volume = pencil.volume if pencil.measured else None
     if volume is None:
         raise ValueError("problem: got matrices without dimension or volume; give `sparse_pencil` both numbers")
-    if any(part.metric is not None and part.null_space is None for part in pencil.parts):
+    if any(part.has_potential for part in pencil.parts):
         raise ValueError("problem: got an operator with a potential, which Weyl's law omits; use `count_eigenvalues`")
     require_real("values", values)
     numbers = np.asarray(values, np.float64)
@@ -116,6 +116,6 @@ def _grid_rim(field: TensorField, space: GridSpace, axis: int) -> float:
         rim, density = (array.take(range(n - 2), axis) for array in (rim, density))
     faces = np.where(rim, density, 0).sum(axis=tuple(others))
     sign = np.full(faces.size, -1.0 if "dirichlet" in space.boundary[-1] else 1.0)
-    for end, condition in zip((0, -1), space.boundary[axis], strict=True):
-        sign[end] = -1 if condition == "dirichlet" else 1
+    if not space.periodic[axis]:
+        sign[[0, -1]] = [-1 if condition == "dirichlet" else 1 for condition in space.boundary[axis]]
     return float(faces @ sign)

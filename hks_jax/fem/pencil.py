@@ -62,6 +62,11 @@ class Pencil(SymmetricPencil):
         return self.null_space is not None or self.lower_bound is not None
 
     @property
+    def has_potential(self) -> bool:
+        """Whether the operator of a field or a mesh has a potential, or a stiffness of the user's own."""
+        return self.metric is not None and self.null_space is None
+
+    @property
     def measured(self) -> bool:
         """Whether dimension and volume are known, which Weyl's law requires."""
         return self.volume is not None and self.space.dimension is not None

@@ -56,9 +56,10 @@ class Smoothing(InnerProduct):
         return self.factor.solve(values) * self.cell / self.length**2
 
 
-def smoothing(grid: Grid, length: float, dtype: np.dtype) -> Smoothing:
-    """Return the inner product of nodal values on a grid's domain."""
-    pencil = assemble(flat_field(grid, dtype), mass="lumped")
+def smoothing(grid: Grid, length: float, dtype: np.dtype, periodic: tuple[bool, ...]) -> Smoothing:
+    """Return the inner product of nodal values on a grid's domain, given which axes are periodic."""
+    boundary = tuple("periodic" if wraps else "neumann" for wraps in periodic)
+    pencil = assemble(flat_field(grid, dtype), boundary, "lumped")
     assert isinstance(pencil, Pencil)
     factor = None
     if length > 0:

@@ -7,6 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
@@ -15,6 +17,7 @@ from hks_jax.eigen.automatic import choose_for_fit
 from hks_jax.eigen.solver import Eigensolver
 from hks_jax.fem.assembly import assemble
 from hks_jax.fem.boundary import BoundarySpec
+from hks_jax.fem.space import GridSpace
 from hks_jax.inverse import checkpoint as files
 from hks_jax.inverse.metric_fit import MetricFit, Step
 from hks_jax.inverse.observation import Data, Observation, observe
@@ -118,9 +121,12 @@ def fit_metric(
         return Problem(unknowns, observed, tuple(regularisers), pairs, boundary, chosen)
 
     problems = [problem_of(each, each.pairs_needed(k, pencil, init)) for each in observed.stages(search.continuation)]
-    first, inner_product = unknowns.start(), choose_inner_product(unknowns, search.smoothness, noise)
+    first, space = unknowns.start(), pencil.space
+    assert isinstance(space, GridSpace)
+    inner_product = choose_inner_product(unknowns, search.smoothness, noise, space.periodic)
     settings = {**vars(data), **vars(search), "max_steps": None}
-    mark = files.fingerprint(observed, unknowns, regularisers, settings, repr((k, boundary)))
+    at_first = unknowns.field(first).domain_tensors  # functions are hashed by name only
+    mark = files.fingerprint(observed, unknowns, regularisers, settings, repr((k, boundary)), at_first)
     now = files.Checkpoint(first, [], 0, 0, 1.0, first, [])
     if checkpoint is not None and Path(checkpoint).exists():
         now = files.load(checkpoint, mark)
@@ -151,13 +157,16 @@ def fit_metric(
             f"noise: the fit ended ({result}) with residuals of {(2 * misfit) ** 0.5:.2g}, above the noise "
             f"{noise:.2g}. {_UNEXPLAINED}, weaker regularisers, or a larger noise"
         )
-    elif noise is None and ended and misfit > max(_EXPLAINED * discretisation, 2 * search.tolerance**2):
+    elif noise is None and ended and misfit > np.fmax(_EXPLAINED * discretisation, 2 * search.tolerance**2):
         size, error = (2 * misfit) ** 0.5, (2 * discretisation) ** 0.5
-        above = "above" if misfit > discretisation else "not explained by the metric, beside"
+        why = "not explained by the metric"
+        if not np.isnan(error):
+            why = "above" if misfit > discretisation else f"{why}, beside"
+            why += f" the discretisation error of about {error:.2g}"
         warn_of_accuracy(
-            f"target: the fit ended ({result}) with residuals of {size:.2g}, {above} the discretisation error of about "
-            f"{error:.2g}. {_UNEXPLAINED}, more steps, or weaker regularisers. If the target was measured, or computed "
-            f"on another grid, pass its error as noise: at least {max(size, error):.2g}"
+            f"target: the fit ended ({result}) with residuals of {size:.2g}, {why}. {_UNEXPLAINED}, more steps, or "
+            f"weaker regularisers. If the target was measured, or computed on another grid, pass its error as noise: "
+            f"at least {np.fmax(size, error):.2g}"
         )
     field, history, losses = unknowns.field(values), tuple(now.history), tuple(now.losses)
     return MetricFit(field, float(outcome.loss), misfit, left, history, result, values, problem, losses, noise)

@@ -44,7 +44,8 @@ class _State(eqx.Module):
 
 
 def _linearise(fn: Callable, values: Values, args: Any) -> tuple[Any, Any]:
-    residual, product, aux = jax.linearize(lambda v: fn(v, args), values, has_aux=True)
+    # Compiled as a whole, the function has the same constants in every linearisation.
+    residual, product, aux = jax.linearize(lambda v: eqx.filter_jit(fn)(v, args), values, has_aux=True)
     jacobian = lx.FunctionLinearOperator(product, jax.eval_shape(lambda: values))
     return optx.FunctionInfo.ResidualJac(residual, jacobian), aux
 

@@ -60,9 +60,10 @@ def biharmonic_distance(pairs: Eigenpairs, sources: Any) -> Float[Array, "n_sour
     """
     require_pairs(pairs)
     known = pairs.null_space_known or not is_traced(jax.lax.stop_gradient(pairs.eigenvalues))
-    if known and pairs.n_null > 1:
+    count = pairs.n_null if known else 0
+    if count and (components := max(count, pairs.space.n_components)) > 1:  # some may have Dirichlet nodes
         raise ValueError(
-            f"pairs: got eigenpairs of {pairs.n_null} components, between which the biharmonic distance is infinite; "
+            f"pairs: got eigenpairs of {components} components, between which the biharmonic distance is infinite; "
             "expected one component. Compute the eigenpairs of each component separately"
         )
     positive_range(pairs)

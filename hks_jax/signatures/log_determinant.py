@@ -82,10 +82,12 @@ def heat_coefficients(
     require_number("euler_characteristic", euler_characteristic, above=-math.inf)
     require_number("boundary_length", boundary_length, inclusive=True)
     area = volume_of(pairs, "the heat trace")
-    if pairs.problems[0].pencil.weighted_volume is not None:
+    first = pairs.problems[0].pencil
+    if first.weighted_volume is not None or first.has_potential:
         raise ValueError(
-            "pairs: got an operator whose volume element is not that of its metric (Fick's, or with a density); "
-            "expected a Laplace–Beltrami operator, whose a₂ is known. Pass your own coefficients to `log_determinant`"
+            "pairs: got an operator with a potential, or whose volume element is not that of its metric (Fick's, or "
+            "with a density); expected a Laplace–Beltrami operator, whose a₂ is known. Pass your own coefficients to "
+            "`log_determinant`"
         )
     length = jnp.asarray(boundary_length, area.dtype) * (1 if condition == "neumann" else -1)
     constant = euler_characteristic / 6 + float(((math.pi - angles) ** 2 / (24 * math.pi * angles)).sum())

@@ -130,11 +130,11 @@ def rim_of(pencil: AnyPencil) -> Bool[np.ndarray, "*shape"]:
 def is_known(pairs: Eigenpairs) -> bool:
     """Return whether `boundary_influence` can tell the influence of the boundary on eigenpairs.
 
-    The estimate is for Brownian motion without a potential, so with a potential the null space is unknown.
+    The estimate is for Brownian motion without a potential.
     """
     first = pairs.problems[0].pencil
     of_domain = isinstance(first.space, GridSpace | MeshSpace) and first.metric is not None
-    return of_domain and (first.null_space is not None or not is_estimated(pairs))
+    return of_domain and not (first.has_potential and is_estimated(pairs))
 
 
 # From the distance d to a straight side, the first passage time τ has E exp(−4τ/t) = exp(−2d/√t), and the function
