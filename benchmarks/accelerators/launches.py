@@ -179,7 +179,7 @@ def derivatives(n: int, k: int) -> Iterator[Task]:
         unknowns = Nodal(PARAMETRISATIONS["log-euclidean"], flat, space.domain)
         observation, _ = observe(np.ones((3, n, n)), times, Data(), space, dtype)
         problem = Problem(unknowns, observation, (), k, "neumann", "block-lanczos")
-        method = GaussNewton(1e-4, 1e-4, 10.0, smoothing(grid, 0.1, dtype))
+        method = GaussNewton(1e-4, 1e-4, 10.0, smoothing(grid, 0.1, dtype, (False,) * grid.dimension))
         values = unknowns.start()
         state = optimise._begin(method, optimise._residuals, values, problem)
         taken = method, optimise._residuals, values, problem, state, jnp.zeros((), dtype)

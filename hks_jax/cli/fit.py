@@ -241,7 +241,7 @@ def _initial(args: argparse.Namespace, target: TensorVolume, grid: Grid, progres
     if volume.shape != grid.shape:
         remedy = "Give one tensor for each node of the target"
         if volume.dimension > grid.dimension:
-            remedy = f"Write the slice by 'hks-jax convert {args.init} slice.npz --slice z=14', and pass that file"
+            remedy = f"Write it by 'hks-jax convert {args.init} slice.npz --slice AXIS=INDEX', and pass that file"
         raise ValueError(
             f"--init: got tensors of shape {volume.shape}; expected the target's shape {grid.shape}. {remedy}"
         )

@@ -85,11 +85,14 @@ def _describe_result(result: Result) -> dict[str, Any]:
         "times": times_in_words(result.times, result.lengths, result.unit, result.length_unit),
         "D": "" if result.diffusivity is None else f"{result.diffusivity:.3g}, {MEDIAN}",
         "near the rim": _shares(result),
-        "to draw it": f"hks-jax plot {source} -o picture.png",
     }
+    on_grid = isinstance(result.place, TensorVolume)
+    if on_grid:
+        facts["to draw it"] = f"hks-jax plot {source} -o picture.png"
     if result.name == "hks":
         facts["to explore it"] = f"hks-jax explore {source}"
-        facts["for regions"] = f"hks-jax stats {source} --atlas LABELS"
+        command, labels = ("stats", "atlas") if on_grid else ("explore", "labels")
+        facts["for regions"] = f"hks-jax {command} {source} --{labels} LABELS"
     return facts
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool
 from scipy.spatial import cKDTree
 
-from hks_jax.cli.computation import Domain, Mesh, OfMesh, Settings, use_dtype
+from hks_jax.cli.computation import Domain, Mesh, OfMesh, Settings, describe_input, use_dtype
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import Reading, read
 from hks_jax.domain.simplices import WORDS, signed_measure
@@ -26,6 +26,9 @@ from hks_jax.io.tensor_order import Order, matrices
 from hks_jax.io.volume import digest
 from hks_jax.optional import optional
 from hks_jax.signatures.times import suitable_times
+
+_TENSORS = ("source", "sha256", "array", "order", "frame")
+"""The facts about tensors that the record of each result has."""
 
 
 class MeshFile(NamedTuple):
@@ -76,9 +79,13 @@ def _with_metric(mesh_file: MeshFile, volume: TensorVolume | None, settings: Set
         with_metric: Mesh = kind.from_tensors(vertices, cells, tensors, settings.metric, **how)
         return with_metric
 
-    def made(mesh: Mesh, *tensors: Any) -> OfMesh:
-        about = {"source": str(file), **describe_mesh(file, mesh)}
-        return Domain(mesh, mesh, about, found.written, found.origin, *tensors)
+    def made(mesh: Mesh, *tensors: Any, **origin: Any) -> OfMesh:
+        about, record = {"source": str(file), **describe_mesh(file, mesh)}, dict(found.origin)
+        if origin:
+            del about["suits"]  # times in the metric of space
+            about["tensors"] = origin
+            record |= {f"tensors_{name}": str(value) for name, value in origin.items() if name in _TENSORS}
+        return Domain(mesh, mesh, about, found.written, record, *tensors)
 
     if volume is not None:
         at = np.arange(len(vertices)) if mask is None else np.flatnonzero(mask)
@@ -95,12 +102,14 @@ def _with_metric(mesh_file: MeshFile, volume: TensorVolume | None, settings: Set
                 raise ValueError(f"{error.fact}. {remedy}") from error
             return of_tensors(tensors)
 
-        return made(sampled(volume.tensors), volume.tensors, sampled, volume)
+        return made(sampled(volume.tensors), volume.tensors, sampled, volume, **describe_input(volume))
     if mesh_file.array is None:
         _tell_of_tensors(found.arrays, progress)
         return made(kind(vertices, cells, mask=mask))
     tensors, place = _tensors_in(found.arrays, mesh_file.array, mesh_file.order, progress)
-    return made(of_tensors(tensors.astype(dtype), place), tensors.astype(dtype), partial(of_tensors, at=place))
+    origin: dict[str, Any] = {"array": mesh_file.array, "at": place, "order": mesh_file.order or "matrix"}
+    tensors = tensors.astype(dtype)
+    return made(of_tensors(tensors, place), tensors, partial(of_tensors, at=place), **origin)
 
 
 def describe_mesh(path: Path, mesh: SimplicialMesh) -> dict[str, Any]:

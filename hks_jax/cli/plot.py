@@ -228,6 +228,7 @@ def _curves(result: Result, args: argparse.Namespace) -> Any:
     from hks_jax.plot import hks_curves, new_figure
     from hks_jax.plot.signature import placed
 
+    refuse(args, ("slice", "through", "quantiles"), "--points draws curves; leave this option out")
     grid, d, flat = result.grid, result.dimension, result.normalisation == "flat"
     values = result.values / result.flat_scale if flat else result.values  # hks_curves multiplies by this scale
     orientation = placed(result.volume, None, "neurological")

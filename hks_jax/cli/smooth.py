@@ -22,7 +22,6 @@ examples:
 
 import argparse
 import math
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -147,9 +146,7 @@ def _on_grid(args: argparse.Namespace, progress: Progress) -> OfVolume:
 def _on_mesh(args: argparse.Namespace, progress: Progress) -> OfMesh:
     metric = None if args.operator == "fick" else "inverse"
     require_mesh_options(args)
-    domain = read_domain(MeshFile.of(args, args.mesh), Settings.of(args, metric=metric), progress)
-    about = domain.about | {"tensors": None if args.tensors is None else str(args.tensors)}
-    return replace(domain, about=about)
+    return read_domain(MeshFile.of(args, args.mesh), Settings.of(args, metric=metric), progress)
 
 
 def _draw(domain: OfVolume, args: argparse.Namespace, before: np.ndarray, after: np.ndarray, path: Path) -> None:

@@ -151,7 +151,8 @@ class Result:
             lengths = None if self.lengths is None else self.lengths.tolist()
             record |= {"units": self.units, "lengths": lengths}
         for suffix in filter(None, (".npz", *images)):
-            given: dict[str, Any] = times if suffix.startswith(".nii") else extra
+            # Headers of NIfTI and NRRD have no room for arrays of the volume's size.
+            given: dict[str, Any] = times if suffix.startswith((".nii", ".nrrd")) else extra
             if suffix == ".npz" and isinstance(self.place, TensorVolume):
                 given = {**extra, "input_tensors": self.place.tensors.astype(np.float32)}
             path, shown = stem.with_name(stem.name + suffix), values if self.times.size else values[0]

@@ -144,3 +144,16 @@ def test_influence_errors():
         hj.boundary_influence(field, [0.1], 10, "dirichlet")
     with pytest.raises(ValueError, match="no rim"):
         hj.boundary_influence(field, [0.1], 10, "periodic")
+
+
+@pytest.mark.filterwarnings("ignore:boundary.*which the mask does not reach")
+@pytest.mark.parametrize("boundary", ["dirichlet", "mean"])
+def test_a_rim_on_the_seam_of_a_periodic_axis_counts_like_any_other(boundary):
+    band = np.zeros((16, 16), bool)
+    band[4:12] = True
+    counts = []
+    for shift in (0, -4):  # an isometry
+        grid = hj.Grid((16, 16), mask=np.roll(band, shift, 0), components="all")
+        field = hj.TensorField(grid, np.tile(np.eye(2), (16, 16, 1, 1)))
+        counts.append(hj.weyl_count(hj.assemble(field, ("periodic", "periodic", boundary)), [1.0], field))
+    np.testing.assert_allclose(counts[1], counts[0], rtol=1e-12)

@@ -122,8 +122,9 @@ def test_no_step_is_chosen_where_what_was_taken_will_do():
 
 def preconditioner(field, times):
     """Return the unknowns, the inner product and the inverse of the preconditioner as a function of damping."""
-    unknowns = Nodal(PARAMETRISATIONS["conformal"], field, hj.assemble(field).space.domain)
-    mass = choose_inner_product(unknowns, 0.0, None)
+    space = hj.assemble(field).space
+    unknowns = Nodal(PARAMETRISATIONS["conformal"], field, space.domain)
+    mass = choose_inner_product(unknowns, 0.0, None, space.periodic)
     information = conformal_information(unknowns, mass, jnp.asarray(times))
     eye = jnp.eye(unknowns.start().size)
 

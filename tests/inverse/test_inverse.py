@@ -329,6 +329,33 @@ def test_a_regulariser_smooths_what_noise_roughens(rng):
 
 
 @pytest.mark.slow
+def test_a_function_of_a_scalar_with_constants_of_its_own_is_fitted(tmp_path):
+    target = signature(hj.TensorField(GRID, 1.2 * FLAT.tensors))
+    fit = hj.fit_metric(GRID, target, TIMES, Free(lambda s: s * 1.5 * FLAT.tensors, jnp.array(0.6)), k=K)
+    assert float(fit.values[0]) == pytest.approx(0.8, rel=1e-6)
+    # Checkpoints tell functions apart by their tensors.
+    options = {"k": K, "checkpoint": tmp_path / "fit.npz", "search": Search(max_steps=2)}
+    first, second = (
+        hj.TensorField.from_function(lambda x, level=level: level * jnp.eye(2) + 0 * x[0], GRID) for level in (1.0, 1.5)
+    )
+    hj.fit_metric(first, target, TIMES, "conformal", **options)
+    with pytest.raises(ValueError, match="belongs to another fit"):
+        hj.fit_metric(second, target, TIMES, "conformal", **options)
+
+
+@pytest.mark.slow
+def test_a_fit_knows_nodes_that_only_a_periodic_axis_joins():
+    mask = np.zeros((12, 12), bool)
+    mask[:6] = mask[11] = True
+    field = hj.TensorField(hj.Grid((12, 12), 1 / 12, mask=mask), np.tile(np.eye(2), (12, 12, 1, 1)))
+    boundary, times = ("periodic", "neumann"), [0.05, 0.1]
+    target = hj.hks(hj.eigenpairs(field, 40, boundary), times)
+    start = hj.TensorField(field.grid, 1.1 * field.tensors)
+    fit = hj.fit_metric(start, target, times, "conformal", boundary=boundary)
+    np.testing.assert_allclose(fit.field.tensors[mask], np.tile(np.eye(2), (mask.sum(), 1, 1)), atol=1e-5)
+
+
+@pytest.mark.slow
 def test_checkpoints_resume_where_a_fit_was_interrupted(tmp_path):
     target, file = signature(CONFORMAL), tmp_path / "deep" / "fit.npz"
 

@@ -129,6 +129,10 @@ def test_what_is_refused_and_warned_of():
         hj.log_determinant(pairs, [1.0, 0.0, 0.0], extrapolate=(0,))
     with pytest.raises(ValueError, match="corners: got"):
         hj.heat_coefficients(pairs, 1, corners=[90.0])
+    plane = hj.TensorField(hj.Grid((5, 5)), np.tile(np.eye(2), (5, 5, 1, 1)))
+    potential = hj.eigenpairs(hj.assemble(plane, potential=3.0), 4)
+    with pytest.raises(ValueError, match="got an operator with a potential"):
+        hj.heat_coefficients(potential, 1)
     negative = eqx.tree_at(lambda p: p.eigenvalues, pairs, pairs.eigenvalues - 1)
     with pytest.raises(ValueError, match="expected none below zero"):
         hj.log_determinant(negative, [1.0, 0.0, 0.0])

@@ -459,6 +459,8 @@ def test_other_bad_arguments(pairs):
     apart = hj.TensorField(hj.Grid((4, 9), mask=squares, components="all"), np.broadcast_to(np.eye(2), (4, 9, 2, 2)))
     with pytest.raises(ValueError, match=r"pairs: got eigenpairs of 2 components.* infinite"):
         hj.biharmonic_distance(hj.eigenpairs(apart, 32), (0, 0))
+    with pytest.raises(ValueError, match=r"pairs: got eigenpairs of 2 components.* infinite"):  # one of them is pinned
+        hj.biharmonic_distance(hj.eigenpairs(apart, 20, ("neumann", ("dirichlet", "neumann"))), (0, 8))
     with pytest.raises(ValueError, match="n_frequencies: got 200; expected 1 to 129 for 256 times"):
         hj.scale_invariant_hks(pairs, 200)
     with pytest.raises(ValueError, match="n: got 0"):

@@ -53,7 +53,7 @@ def write_group(study: Study, subjects: list[Subject], problems: Mapping[str, st
     tables = [(ids[subject.name], read_table(study.path(subject, f"{REGIONS}.tsv"))) for subject in done]
     columns = list(dict.fromkeys(name for _, rows in tables for row in rows for name in row))
     joined = [(*who, *map(row.get, columns)) for who, rows in tables for row in rows]
-    about = read_json(study.path(done[0], f"{REGIONS}.json"))
+    about = {key: value for s in reversed(done) for key, value in read_json(study.path(s, f"{REGIONS}.json")).items()}
     described = {name: about[name] for name in (*columns, "Settings") if name in about}
     return files + write_table(joint, (*head, *columns), joined, described)
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NoReturn
 
+from hks_jax.cli.combinations import require_noise_options
 from hks_jax.cli.options import COLUMNS, FILES, add_atlas, add_file, add_names, add_noise, add_reading
 from hks_jax.cli.reading import is_file
 from hks_jax.io.bids import format_entities
@@ -81,6 +82,8 @@ def read_subjects(path: Path, common: argparse.Namespace) -> list[Subject]:
             if not words or words[0].startswith("--"):
                 raise ValueError("got no file; expected a file in every row")
             arguments, problem = parser.parse_args(words, copy.copy(common)), ""
+            if "--draws" in words:  # of the row, not of all subjects
+                require_noise_options(arguments)
             if is_file(arguments.noise):
                 arguments.noise = str(path.parent / arguments.noise)
         except ValueError as error:
