@@ -17,6 +17,7 @@ from hks_jax.cli.progress import Progress
 from hks_jax.io import TensorVolume, read_tensors, save_tensors
 from hks_jax.io.formats import format_of
 from hks_jax.io.result import Result
+from hks_jax.io.volume import digest
 from hks_jax.naming import argument, named_as_options, with_option
 
 SHAPE = (14, 12, 5)
@@ -263,7 +264,21 @@ def test_signature_of_a_solid_with_tensors_at_its_vertices(tmp_path, capsys):
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["input"]["tetrahedra"] == 540
     assert report["input"]["boundary_vertices"] == 92
+    assert report["input"]["tensors"] == {"array": "D", "at": "vertices", "order": "matrix"}
+    assert "suits" not in report["input"]  # times of the metric of space
     assert (tmp_path / "out" / "hks.png").stat().st_size > 5000
+    capsys.readouterr()
+    assert main(["info", str(tmp_path / "out")]) == 0
+    told = capsys.readouterr().out
+    assert "--labels LABELS" in told
+    assert "hks-jax plot" not in told  # draws grids only
+    affine = np.diag([0.6, 0.6, 0.6, 1.0])
+    affine[:3, 3] = -1.2
+    np.savez(tmp_path / "t.npz", tensors=np.tile(1e-3 * np.eye(3), (5, 5, 5, 1, 1)), affine=affine)
+    assert main([*command, "--tensors", str(tmp_path / "t.npz"), "--metric", "inverse", "--times", "300", "600"]) == 0
+    found = json.loads((tmp_path / "out" / "report.json").read_text())["input"]["tensors"]
+    assert (found["source"], found["sha256"]) == (str(tmp_path / "t.npz"), digest(tmp_path / "t.npz"))
+    assert json.loads((tmp_path / "out" / "hks.vtu.json").read_text())["tensors_sha256"] == found["sha256"]
 
     of_tensors = ["--array", "D", "--metric", "inverse"]
     assert main([*command, *of_tensors, "--noise", "0.01"]) == 0
@@ -422,12 +437,16 @@ def test_signatures_come_in_the_format_of_the_tensors(tensors, tmp_path, library
     assert format_of(tmp_path / f"t{suffix}").image == suffix
     report = {"settings": {"k": 3, "metric": "inverse"}}
     volume = replace(volume, tensors=volume.tensors.astype(np.float32))
-    result = Result(volume, np.ones((2, *SHAPE)), np.array([1.0, 2.0]), np.arange(3.0), report)
+    influence = np.zeros((2, *SHAPE), np.float32)
+    result = Result(
+        volume, np.ones((2, *SHAPE)), np.array([1.0, 2.0]), np.arange(3.0), report, {"influence": influence}
+    )
     out = tmp_path / "out"
     write_outputs(out, result, Progress(quiet=True), Path.touch, suffix)
     more = {".nii.gz": {"hks.json"}, ".vti": {"hks.pvd", "hks.pvd.json", "hks.0.vti", "hks.1.vti"}}.get(suffix, set())
     assert {file.name for file in out.iterdir()} == {f"hks{suffix}", "hks.npz", "hks.png", "report.json"} | more
-    assert b"hks-jax " in (out / f"hks{suffix}").read_bytes() or suffix != ".nrrd"  # headers are text
+    written = (out / f"hks{suffix}").read_bytes()
+    assert suffix != ".nrrd" or (b"hks-jax " in written and b"influence" not in written)  # headers are text
     with np.load(out / "hks.npz") as read:
         record = json.loads(str(read["provenance"]))
         assert read["hks"].dtype == np.float32  # as the tensors are

@@ -194,6 +194,7 @@ def test_plot_of_a_volume(tmp_path, capsys):
         (["--slice", "x=6"], "--slice: index: got x = 6; expected 0 … 5"),
         (["--points", "1,2"], "expected 3 coordinates"),
         (["--slice", "x=2", "--through", "1,2,3"], "--slice: --through draws three slices"),
+        (["--slice", "x=2", "--points", "1,2,3"], "--slice: --points draws curves"),
     ):
         assert error_of(capsys, main(["plot", str(path), "-o", str(tmp_path / "p.png"), *more]), words) == 2
 
