@@ -205,7 +205,8 @@ def _reviewed(volume: TensorVolume, reading: Reading, ask: Callable[[str], None]
         if reading.strict_unit and not volume.unit and question == unit_question(volume):
             raise ValueError(
                 f"{reading.file}: {question}. The tensors of all subjects must have the same unit. If the "
-                "numbers are in mm²/s, pass --unit mm2/s, or add a column named unit to the table"
+                "numbers are in mm²/s, pass --unit mm2/s, or add a column named unit to the table or, for bids, "
+                "Units to the sidecar of the file"
             )
         ask(question)
     return volume

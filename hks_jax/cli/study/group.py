@@ -68,7 +68,8 @@ def other_units(study: Study, done: list[Subject]) -> dict[str, str]:
     span = LIVING_TISSUE[1] / LIVING_TISSUE[0]
     return {
         name: f"{FAILED}--unit: got a median mean diffusivity of {value:.3g}, but the median of the study is "
-        f"{middle:.3g}; expected the same unit for all subjects. Give the units by --unit or by a column named unit"
+        f"{middle:.3g}; expected the same unit for all subjects. Give the units by --unit, by a column named unit "
+        "or, for bids, by Units in the sidecars"
         for name, value in medians.items()
         if not 1 / span <= value / middle <= span
     }
