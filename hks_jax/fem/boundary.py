@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import require_count
 from hks_jax.domain.components import active_elements, as_mask, element_nodes, rim_nodes
 from hks_jax.domain.grid import Grid
@@ -96,27 +97,36 @@ def default_boundary(inside: Bool[np.ndarray, "*shape"]) -> tuple[str, str]:
     )
 
 
-def without_effect(grid: Grid, boundary: BoundarySpec) -> str:
-    """Return a warning of conditions where the grid's domain has no boundary, or an empty string."""
-    *axes, (rim, _) = normalise_boundary(boundary, grid.dimension)
+def sides_of(grid: Grid, boundary: BoundarySpec) -> tuple[Sides, ...]:
+    """Return `normalise_boundary`, and warn of conditions where the grid's domain has no boundary.
+
+    Warns:
+        AccuracyWarning: the mask does not reach the side of a condition, or there is no mask for the rim's condition.
+    """
+    *axes, (rim, _) = sides = normalise_boundary(boundary, grid.dimension)
     if grid.inside.all() and rim == "dirichlet" and not any("dirichlet" in pair for pair in axes):
         where = "acts nowhere: there is no mask, and so no rim. Leave this condition out"
-        return f'boundary: got {boundary!r}, but "dirichlet" {where}'
+        warn_of_accuracy(f'boundary: got {boundary!r}, but "dirichlet" {where}')
+    reached = [[bool(np.take(grid.inside, index, axis).any()) for index in (0, -1)] for axis in range(grid.dimension)]
+    # Periodic conditions need both sides, and mirrors, which are always on both, one of them. Mirrors that are nowhere
+    # are an error of the caller's.
+    mirrored = any(any(here) for here, pair in zip(reached, axes, strict=True) if "mirror" in pair)
     found = {}
-    for axis, (name, conditions) in enumerate(zip("xyz", axes, strict=False)):
-        reached = [bool(np.take(grid.inside, index, axis).any()) for index in (0, -1)]
-        if conditions[0] in ("periodic", "mirror"):  # always on both sides: the first needs both, the second one
-            reached = [all(reached) if conditions[0] == "periodic" else any(reached)] * 2
-        for side, condition, here in zip(("low", "high"), conditions, reached, strict=True):
-            if not here and condition not in ("neumann", rim):
+    for name, here, pair in zip("xyz", reached, axes, strict=False):
+        acts = [all(here)] * 2 if "periodic" in pair else [any(here) or not mirrored] * 2 if "mirror" in pair else here
+        for side, condition, at in zip(("low", "high"), pair, acts, strict=True):
+            if not at and condition not in ("neumann", rim):
                 found[f"the {side} side of {name}"] = condition
-    if not found:
-        return ""
-    distinct = dict.fromkeys(found.values())
-    names = " and ".join(f'"{name}"' for name in distinct) + (" has" if len(distinct) == 1 else " have")
-    where = "any side of the grid" if len(found) == 2 * grid.dimension else ", ".join(found)
-    own = 'has the natural condition, unless you pass "dirichlet-rim" or "mean"' if rim == "neumann" else f'has "{rim}"'
-    return f"boundary: {names} no effect at {where}, which the mask does not reach; the rim of the mask {own}"
+    if found:
+        distinct = dict.fromkeys(found.values())
+        names = " and ".join(f'"{name}"' for name in distinct) + (" has" if len(distinct) == 1 else " have")
+        where = "any side of the grid" if len(found) == 2 * grid.dimension else ", ".join(found)
+        own = 'has the natural condition, unless you pass "dirichlet-rim" or "mean"'
+        own = own if rim == "neumann" else f'has "{rim}"'
+        warn_of_accuracy(
+            f"boundary: {names} no effect at {where}, which the mask does not reach; the rim of the mask {own}"
+        )
+    return sides
 
 
 def doubled_problems(boundary: tuple[Sides, ...]) -> list[tuple[Sides, ...]]:

@@ -3,10 +3,9 @@
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
-from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
-from hks_jax.fem.boundary import BoundarySpec, doubled_problems, normalise_boundary, without_effect
+from hks_jax.fem.boundary import BoundarySpec, doubled_problems, sides_of
 from hks_jax.fem.space import FunctionSpace, GridSpace, MeshSpace, grid_space, mesh_space
 
 MESH_BOUNDARIES = ("neumann", "dirichlet", "mean")
@@ -24,8 +23,7 @@ def problems_of(
             that has no inner nodes.
 
     Warns:
-        AccuracyWarning: a condition has no effect, because the mask does not reach its side of the grid, or because
-            there is no mask.
+        AccuracyWarning: a condition has no effect (`sides_of`).
     """
     spaces: list[GridSpace] | list[MeshSpace]
     if isinstance(domain, SimplicialMesh):
@@ -35,7 +33,7 @@ def problems_of(
         spaces = _spaces(lambda condition: mesh_space(domain.triangulation, condition, degree), conditions, boundary)
         mirrored = False
     else:
-        sides = normalise_boundary(boundary, domain.grid.dimension)
+        sides = sides_of(domain.grid, boundary)
         spaces = _spaces(lambda problem: grid_space(domain.grid, problem), doubled_problems(sides), boundary)
         mirrored = any("mirror" in pair for pair in sides)
     if len(spaces) > 1 and spaces[0].n_dof == spaces[-1].n_dof:  # all problems are the same
@@ -45,8 +43,6 @@ def problems_of(
             if mirrored
             else 'boundary: got "mean", but the domain has no rim; pass "neumann"'
         )
-    if isinstance(domain, TensorField) and (message := without_effect(domain.grid, boundary)):
-        warn_of_accuracy(message)
     return spaces
 
 
