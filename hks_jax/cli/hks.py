@@ -99,4 +99,4 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
 
     draw = partial(signature_panels, result, view=args.view, through=args.through, show_rim=args.show_rim)
     done = write_outputs(args.output, result, progress, draw, *domain.images, origin=domain.origin)
-    return done._replace(files=[*done.files, *[kept] * args.save_pairs])
+    return done._replace(files=done.files + [kept] * args.save_pairs)

@@ -82,7 +82,6 @@ def _with_metric(mesh_file: MeshFile, volume: TensorVolume | None, settings: Set
     def made(mesh: Mesh, *tensors: Any, **origin: Any) -> OfMesh:
         about, record = {"source": str(file), **describe_mesh(file, mesh)}, dict(found.origin)
         if origin:
-            del about["suits"]  # times in the metric of space
             about["tensors"] = origin
             record |= {f"tensors_{name}": str(value) for name, value in origin.items() if name in _TENSORS}
         return Domain(mesh, mesh, about, found.written, record, *tensors)
@@ -113,15 +112,12 @@ def _with_metric(mesh_file: MeshFile, volume: TensorVolume | None, settings: Set
 
 
 def describe_mesh(path: Path, mesh: SimplicialMesh) -> dict[str, Any]:
-    """Return facts about a mesh in space for JSON."""
+    """Return facts about a mesh in space for JSON; also the times that suit it, unless it has another metric."""
     vertices, cells, d = np.asarray(mesh.vertices, np.float64), mesh.triangulation.cells, mesh.triangulation.dimension
     measure = float(np.sum(signed_measure(vertices, cells)[0])) / math.factorial(d)
     sides = [vertices[cells[:, i]] - vertices[cells[:, j]] for i, j in combinations(range(d + 1), 2)]
-    edge = float(np.median(np.linalg.norm(np.concatenate(sides), axis=1)))
-    size, rim = float(np.linalg.norm(np.ptp(vertices, axis=0))), mesh.triangulation.boundary_vertices
-    used = mesh.triangulation.used
-    depth = float(np.median(cKDTree(vertices[rim]).query(vertices[used])[0])) if rim.any() else math.inf
-    return {
+    edge, rim = float(np.median(np.linalg.norm(np.concatenate(sides), axis=1))), mesh.triangulation.boundary_vertices
+    facts = {
         "sha256": digest(path),
         "format": path.suffix,
         "vertices": len(vertices),
@@ -130,8 +126,13 @@ def describe_mesh(path: Path, mesh: SimplicialMesh) -> dict[str, Any]:
         "components": mesh.triangulation.labels[1],
         WORDS[d].measure: measure,
         "median_edge": edge,
-        "suits": {{2: "surface", 3: "solid"}[d]: suitable_times(d, measure, edge**2, size, len(vertices), depth=depth)},
     }
+    if mesh.metric_of_space is None:
+        size, used = float(np.linalg.norm(np.ptp(vertices, axis=0))), mesh.triangulation.used
+        depth = float(np.median(cKDTree(vertices[rim]).query(vertices[used])[0])) if rim.any() else math.inf
+        times = suitable_times(d, measure, edge**2, size, len(vertices), depth=depth)
+        facts["suits"] = {{2: "surface", 3: "solid"}[d]: times}
+    return facts
 
 
 def _tell_of_tensors(arrays: Mapping[str, Mapping[str, np.ndarray]], progress: Progress) -> None:

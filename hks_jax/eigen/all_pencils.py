@@ -35,19 +35,33 @@ def pairs_of_pencils(
     report: Report,
     start: Eigenpairs | None,
 ) -> Eigenpairs:
-    """Return the k lowest pairs of a pencil or, for a doubled domain, of all its problems together.
+    """Return the k lowest pairs of a pencil or, for a doubled domain, of all its problems together."""
+    solvers, starts = choose_solvers(solver, pencil, k), _starts(start, pencil)
+    if len(pencil.parts) > 1:
+        return _of_several(pencil, solvers, starts, k, throw, report)
+    return _solved(_Problem(pencil.parts[0], solvers[0], k, starts[0]), k, throw, report)
+
+
+def _of_several(
+    pencil: AnyPencil,
+    solvers: Sequence[tuple[Eigensolver, ...]],
+    starts: Sequence[PencilEigenpairs | None],
+    k: int,
+    throw: bool,
+    report: Report,
+) -> Eigenpairs:
+    """Return the k lowest pairs of all problems together.
 
     For traced values, each problem is solved for the largest number of pairs that it can have among the k lowest. For
     concrete values, each problem is first solved for an equal share of the k pairs plus a margin, and again for twice
     as many pairs while some of its pairs may be missing.
     """
-    solvers, starts = choose_solvers(solver, pencil, k), _starts(start, pencil)
-    if len(pencil.parts) == 1:
-        return _solved(_Problem(pencil.parts[0], solvers[0], k, starts[0]), k, throw, report)
     problems = []
     for part, own, including, rows in zip(pencil.parts, solvers, pencil.including, starts, strict=True):
         limit = min(max(k // len(including), 1), part.size)
-        problems.append(_Problem(part, _able(own, part, limit), limit, rows))
+        # In a small problem, only the dense solver computes so many pairs.
+        dense = limit >= own[0].max_pairs(part.size)
+        problems.append(_Problem(part, (Dense(own[0].tolerance),) if dense else own, limit, rows))
     share = k if is_traced(jax.lax.stop_gradient(pencil)) else _share(pencil, k)
     wanted = [min(each.limit, max(share, 0 if each.start is None else each.start.k)) for each in problems]
     pairs: dict[int, PencilEigenpairs] = {}
@@ -77,12 +91,6 @@ def _starts(start: Eigenpairs | None, pencil: AnyPencil) -> Sequence[PencilEigen
             "pairs of the same ones"
         )
     return problems
-
-
-def _able(solvers: tuple[Eigensolver, ...], pencil: Pencil, limit: int) -> tuple[Eigensolver, ...]:
-    """Return the solvers, or for a small problem of a doubled domain the dense one, which has no limit."""
-    first = solvers[0]
-    return (Dense(first.tolerance),) if limit >= first.max_pairs(pencil.size) else solvers
 
 
 # By Weyl's law, a problem has N(λ) ≈ V λ^(3/2)/6π² ± S λ/16π eigenvalues below λ in 3D, and (A λ ± L √λ)/4π in 2D; S

@@ -236,7 +236,8 @@ class Eigenpairs(ABC):
         """Return sentences that describe defects of these pairs. Values must be concrete."""
         other = "a larger basis" if "shift-invert" in self.solver_name else "another solver"
         values, bad = np.asarray(self.eigenvalues), ~np.asarray(self.converged)
-        kept, cut = int(np.asarray(self.kept).sum()), int(self.cut_multiplet)
+        kept, (_, cut_multiplet, unconfirmed) = int(np.asarray(self.kept).sum()), self._cut
+        cut = int(cut_multiplet)
         sentences, last = [], values[kept - 1]
         if bad.any():
             missing, worst = int(np.isnan(values).sum()), np.nanmax(np.asarray(self.residuals)[bad], initial=0.0)
@@ -246,7 +247,7 @@ class Eigenpairs(ABC):
                 f"{int(bad.sum())} of {values.size} eigenpairs did not converge ({missing} were not found{found}) "
                 f"with the {self.solver_name} solver. Use {better}fewer pairs, or {other}"
             )
-        if bool(self.unconfirmed) and not np.isnan(last):
+        if bool(unconfirmed) and not np.isnan(last):
             bound = float(self.complete_below)
             where = f"below {last:.6g}" if np.isnan(bound) else f"between {bound:.6g} and {last:.6g}"
             sentences.append(

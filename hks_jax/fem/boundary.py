@@ -108,23 +108,24 @@ def sides_of(grid: Grid, boundary: BoundarySpec) -> tuple[Sides, ...]:
         where = "acts nowhere: there is no mask, and so no rim. Leave this condition out"
         warn_of_accuracy(f'boundary: got {boundary!r}, but "dirichlet" {where}')
     reached = [[bool(np.take(grid.inside, index, axis).any()) for index in (0, -1)] for axis in range(grid.dimension)]
-    # Periodic conditions need both sides, and mirrors, which are always on both, one of them. Mirrors that are nowhere
-    # are an error of the caller's.
     mirrored = any(any(here) for here, pair in zip(reached, axes, strict=True) if "mirror" in pair)
     found = {}
     for name, here, pair in zip("xyz", reached, axes, strict=False):
-        acts = [all(here)] * 2 if "periodic" in pair else [any(here) or not mirrored] * 2 if "mirror" in pair else here
-        for side, condition, at in zip(("low", "high"), pair, acts, strict=True):
-            if not at and condition not in ("neumann", rim):
+        if "periodic" in pair:  # acts on both sides or on none
+            here = [all(here)] * 2
+        elif "mirror" in pair:  # needs one side; the caller refuses mirrors that act nowhere
+            here = [any(here) or not mirrored] * 2
+        for side, condition, acts in zip(("low", "high"), pair, here, strict=True):
+            if not acts and condition not in ("neumann", rim):
                 found[f"the {side} side of {name}"] = condition
     if found:
         distinct = dict.fromkeys(found.values())
         names = " and ".join(f'"{name}"' for name in distinct) + (" has" if len(distinct) == 1 else " have")
         where = "any side of the grid" if len(found) == 2 * grid.dimension else ", ".join(found)
-        own = 'has the natural condition, unless you pass "dirichlet-rim" or "mean"'
-        own = own if rim == "neumann" else f'has "{rim}"'
+        natural = 'has the natural condition, unless you pass "dirichlet-rim" or "mean"'
         warn_of_accuracy(
-            f"boundary: {names} no effect at {where}, which the mask does not reach; the rim of the mask {own}"
+            f"boundary: {names} no effect at {where}, which the mask does not reach; the rim of the mask "
+            + (natural if rim == "neumann" else f'has "{rim}"')
         )
     return sides
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.arrays import ByKey
-from hks_jax.compilation import numpy_where_known
+from hks_jax.compilation import library_of, numpy_where_known
 from hks_jax.domain.components import active_elements, bounding_box, element_nodes, label_nodes, rim_nodes, wrap_nodes
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.triangulation import Triangulation
@@ -121,7 +121,7 @@ def taken(values: Any, indices: Any) -> Any:
 @numpy_where_known(most=_COPIED)
 def _spread(values: Any, indices: Any, fill: Any) -> Any:
     leading = (*values.shape[:-1], 1)
-    if isinstance(values, np.ndarray):
+    if library_of(values) is np:
         full = np.tile(fill, leading)
         full[..., indices] = values
         return full

@@ -246,12 +246,13 @@ def _nested(pencil: Pencil, plan: FilterPlan) -> list[NodalPencil]:
 
     All vectors would be zero on a component without a node on a coarse grid, and filters would keep them zero there.
     """
-    grids, components = [nodal_pencil(pencil)], np.where(pencil.space.free, pencil.space.labels, -1)
-    every = np.unique(components)
+    grids, labels = [nodal_pencil(pencil)], np.where(pencil.space.free, pencil.space.labels, 0)
+    in_each = np.bincount(labels.ravel())[1:]  # the numbers of free nodes
     while True:
-        components = components[(slice(None, None, 2),) * components.ndim]
-        lost = np.setdiff1d(every, components).max(initial=-1) >= 0
-        if lost or min(grids[-1].shape) < _LEAST_NODES or (components >= 0).sum() < _ROOM * plan.size:
+        labels, finer = labels[(slice(None, None, 2),) * labels.ndim], in_each
+        in_each = np.bincount(labels.ravel(), minlength=finer.size + 1)[1:]
+        lost = (finer > 0) & (in_each == 0)
+        if lost.any() or min(grids[-1].shape) < _LEAST_NODES or in_each.sum() < _ROOM * plan.size:
             return grids
         grids.append(coarsen(grids[-1]))
 

@@ -39,8 +39,6 @@ _TRIES = 3
 """The maximal number of shifts that are tried within the spectrum."""
 _POOR = 1e-9
 """The residual, relative to the eigenvalue or the first positive one, up to which a vector needs no further solve."""
-_SOLVES = 2
-"""The maximal number of further solves."""
 _ACCURATE = 1e-9
 """The largest convergence rate of iterative refinement with a factorisation within the spectrum."""
 
@@ -218,18 +216,14 @@ def _shifted(K: csc_matrix, M: csc_matrix, k: int, scales: _Scales) -> tuple[flo
 def _refined(
     K: csc_matrix, M: csc_matrix, s: float, rounding: float, vectors: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return eigenvalues, and the M-orthonormal eigenvectors after further solves for those with large residuals."""
-    factor: SuperLU | None = None
-    for _ in range(_SOLVES):
-        force, image = K @ vectors, M @ vectors
-        values = np.sum(vectors * force, axis=0)
-        residuals, sizes = np.linalg.norm(force - image * values, axis=0), np.abs(values)
-        first = sizes[sizes > rounding].min(initial=sizes.max() / sizes.size)
-        large = residuals > _POOR * np.maximum(sizes, first) * np.linalg.norm(image, axis=0)
-        if not large.any():
-            break
-        factor = factorise_on_host(K + s * M) if factor is None else factor
-        better = factor.solve(image[:, large]) * (values[large] + s)
+    """Return eigenvalues, and the M-orthonormal eigenvectors after a further solve for those with large residuals."""
+    force, image = K @ vectors, M @ vectors
+    values = np.sum(vectors * force, axis=0)
+    residuals, sizes = np.linalg.norm(force - image * values, axis=0), np.abs(values)
+    first = sizes[sizes > rounding].min(initial=sizes.max() / sizes.size)
+    large = residuals > _POOR * np.maximum(sizes, first) * np.linalg.norm(image, axis=0)
+    if large.any():
+        better = factorise_on_host(K + s * M).solve(image[:, large]) * (values[large] + s)
         better -= vectors[:, ~large] @ (image[:, ~large].T @ better)
         values[large], mix = eigh(better.T @ (K @ better), better.T @ (M @ better))
         vectors[:, large] = better @ mix
