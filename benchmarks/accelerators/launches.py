@@ -44,7 +44,7 @@ from hks_jax.inverse.conformal import smoothing  # noqa: E402
 from hks_jax.inverse.gauss_newton import GaussNewton  # noqa: E402
 from hks_jax.inverse.observation import observe  # noqa: E402
 from hks_jax.inverse.problem import Problem  # noqa: E402
-from hks_jax.inverse.unknowns import PARAMETRISATIONS, Nodal, flat_field  # noqa: E402
+from hks_jax.inverse.unknowns import flat_field, unknowns_for  # noqa: E402
 from hks_jax.linear import accelerators  # noqa: E402
 from hks_jax.linear.dissection import dissect  # noqa: E402
 from hks_jax.linear.multifrontal import _eliminate, factorise, try_out  # noqa: E402
@@ -176,10 +176,10 @@ def derivatives(n: int, k: int) -> Iterator[Task]:
     def fit_step() -> tuple:
         flat = flat_field(grid)
         space, dtype = hj.assemble(flat).space, np.dtype(float)
-        unknowns = Nodal(PARAMETRISATIONS["log-euclidean"], flat, space.domain)
+        unknowns = unknowns_for("log-euclidean", flat, space)
         observation, _ = observe(np.ones((3, n, n)), times, Data(), space, dtype)
         problem = Problem(unknowns, observation, (), k, "neumann", "block-lanczos")
-        method = GaussNewton(1e-4, 1e-4, 10.0, smoothing(grid, 0.1, dtype, (False,) * grid.dimension))
+        method = GaussNewton(1e-4, 1e-4, 10.0, smoothing(unknowns, 0.1))
         values = unknowns.start()
         state = optimise._begin(method, optimise._residuals, values, problem)
         taken = method, optimise._residuals, values, problem, state, jnp.zeros((), dtype)

@@ -9,7 +9,6 @@ from jaxtyping import Array, Float
 from hks_jax.arrays import jax_array
 from hks_jax.compilation import jit_quickly
 from hks_jax.domain import spd
-from hks_jax.domain.grid import Grid
 from hks_jax.fem.assembly import assemble
 from hks_jax.fem.pencil import Pencil
 from hks_jax.inverse.unknowns import Nodal, Values, flat_field
@@ -56,10 +55,11 @@ class Smoothing(InnerProduct):
         return self.factor.solve(values) * self.cell / self.length**2
 
 
-def smoothing(grid: Grid, length: float, dtype: np.dtype, periodic: tuple[bool, ...]) -> Smoothing:
-    """Return the inner product of nodal values on a grid's domain, given which axes are periodic."""
-    boundary = tuple("periodic" if wraps else "neumann" for wraps in periodic)
-    pencil = assemble(flat_field(grid, dtype), boundary, "lumped")
+def smoothing(unknowns: Nodal, length: float) -> Smoothing:
+    """Return the inner product of nodal values on the domain of the unknowns."""
+    grid, dtype = unknowns.init.grid, unknowns.init.domain_tensors.dtype
+    seams = (np.moveaxis(edges, axis, 0)[-1].any() for axis, edges in enumerate(unknowns.edges))
+    pencil = assemble(flat_field(grid, dtype), tuple("periodic" if seam else "neumann" for seam in seams), "lumped")
     assert isinstance(pencil, Pencil)
     factor = None
     if length > 0:
@@ -94,7 +94,7 @@ class ConformalInformation(eqx.Module):
 
     unknowns: Nodal  # the conformal factors at the nodes
     root: Float[Array, "n 1"]  # the square roots of the nodal masses, relative to their mean
-    weights: list[Float[Array, "..."]]  # the weights of the grid's edges along each axis
+    weights: Float[Array, "d *shape"]  # the weights of the edges from each node to the next along each axis
     level: Float[Array, ""]  # the parameter λ₁ without damping
     largest: Float[Array, ""]  # an upper bound on the eigenvalues of the Laplacian L
 
@@ -107,7 +107,7 @@ class ConformalInformation(eqx.Module):
 
     def _laplacian(self, y: Values) -> Values:
         slopes, back = jax.vjp(self.unknowns.slopes, y / self.root)
-        return back([weight[None] * slope for weight, slope in zip(self.weights, slopes, strict=True)])[0] / self.root
+        return back(self.weights[:, None] * slopes)[0] / self.root
 
 
 @jit_quickly(eqx.filter_jit)
@@ -118,12 +118,10 @@ def conformal_information(unknowns: Nodal, mass: InnerProduct, times: Float[Arra
     at_nodes = jnp.zeros(grid.size, relative.dtype).at[nodes].set(relative[:, 0]).reshape(grid.shape)
     inverse = spd.inverse(unknowns.init.domain_tensors)
     weights, rows = [], jnp.zeros_like(at_nodes)
-    for axis in range(grid.dimension):
-        size, along = (jnp.moveaxis(x, axis, 0) for x in (at_nodes, inverse[..., axis, axis]))
-        weight = jnp.maximum(size[1:], size[:-1]) * (along[1:] + along[:-1]) / 2
-        weight = jnp.where((size[1:] > 0) & (size[:-1] > 0), weight, 0)
-        weights.append(jnp.moveaxis(weight, 0, axis))
-        around = jnp.pad(weight, [(1, 1), *[(0, 0)] * (grid.dimension - 1)]) / grid.spacing[axis] ** 2
-        rows += jnp.moveaxis(around[1:] + around[:-1], 0, axis)
+    for axis, edges in enumerate(unknowns.edges):
+        along = inverse[..., axis, axis]
+        size, mean = jnp.maximum(at_nodes, jnp.roll(at_nodes, -1, axis)), (along + jnp.roll(along, -1, axis)) / 2
+        weights.append(jnp.where(edges, size * mean, 0))
+        rows += (weights[-1] + jnp.roll(weights[-1], 1, axis)) / grid.spacing[axis] ** 2
     largest = 2 * jnp.max(rows.ravel()[nodes] / relative[:, 0])
-    return ConformalInformation(unknowns, jnp.sqrt(relative), weights, _REACH / jnp.min(times), largest)
+    return ConformalInformation(unknowns, jnp.sqrt(relative), jnp.stack(weights), _REACH / jnp.min(times), largest)

@@ -113,17 +113,17 @@ def fit_metric(
             )
         raise TypeError(f"init: got {type(init).__name__}; expected hks_jax.Grid or hks_jax.TensorField{remedy}")
     pencil = assemble(init, boundary)
-    unknowns = unknowns_for(parametrisation, init, pencil.space.domain)
-    observed, noise = observe(target, times, data, pencil.space, init.domain_tensors.dtype)
+    space = pencil.space
+    assert isinstance(space, GridSpace)
+    unknowns = unknowns_for(parametrisation, init, space)
+    observed, noise = observe(target, times, data, space, init.domain_tensors.dtype)
 
     def problem_of(observed: Observation, pairs: int) -> Problem:
         chosen = choose_for_fit(pencil, pairs) if solver == "auto" else solver
         return Problem(unknowns, observed, tuple(regularisers), pairs, boundary, chosen)
 
     problems = [problem_of(each, each.pairs_needed(k, pencil, init)) for each in observed.stages(search.continuation)]
-    first, space = unknowns.start(), pencil.space
-    assert isinstance(space, GridSpace)
-    inner_product = choose_inner_product(unknowns, search.smoothness, noise, space.periodic)
+    first, inner_product = unknowns.start(), choose_inner_product(unknowns, search.smoothness, noise)
     settings = {**vars(data), **vars(search), "max_steps": None}
     at_first = unknowns.field(first).domain_tensors  # functions are hashed by name only
     mark = files.fingerprint(observed, unknowns, regularisers, settings, repr((k, boundary)), at_first)

@@ -51,7 +51,7 @@ class H1(Regulariser):
 
     def deviations(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, "..."]:
         """Return the slopes of the parameters along the grid's edges."""
-        return jnp.concatenate([slopes.ravel() for slopes in unknowns.slopes(values)])
+        return unknowns.slopes(values)
 
 
 class TotalVariation(Regulariser):
@@ -76,14 +76,7 @@ class TotalVariation(Regulariser):
 
     def deviations(self, unknowns: Unknowns, values: Values, field: TensorField) -> Float[Array, "..."]:
         """Return the parameters' gradients at the nodes, scaled so that half the square is √(|∇p|² + ε²) − ε."""
-        d = field.grid.dimension
-        # At the last node of each axis, the difference to the next node is set to zero.
-        gradient = jnp.stack(
-            [
-                jnp.pad(slopes, [(0, 0)] + [(0, int(axis == along)) for axis in range(d)])
-                for along, slopes in enumerate(unknowns.slopes(values))
-            ]
-        )
+        gradient = unknowns.slopes(values)
         square = jnp.sum(gradient**2, axis=(0, 1), keepdims=True)
         # For the gradient's norm s, 2/(√(s² + ε²) + ε) equals 2(√(s² + ε²) − ε)/s² without cancellation.
         return gradient * jnp.sqrt(2 / (jnp.sqrt(square + self.epsilon**2) + self.epsilon))

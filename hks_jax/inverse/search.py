@@ -75,9 +75,7 @@ class Search:
             require_number("smoothness", self.smoothness, inclusive=True)
 
 
-def choose_inner_product(
-    unknowns: Unknowns, smoothness: float | None, noise: float | None, periodic: tuple[bool, ...]
-) -> InnerProduct:
+def choose_inner_product(unknowns: Unknowns, smoothness: float | None, noise: float | None) -> InnerProduct:
     """Return the inner product for the damping of steps. `Search` documents the default smoothness."""
     if not isinstance(unknowns, Nodal):
         return InnerProduct()
@@ -85,7 +83,7 @@ def choose_inner_product(
     if smoothness is None:
         extent = max(h * (n - 1) for h, n in zip(grid.spacing, grid.shape, strict=True))
         smoothness = 0.1 * extent if unknowns.parametrisation.smooth or noise is not None else 0.0
-    return smoothing(grid, smoothness, unknowns.init.domain_tensors.dtype, periodic)
+    return smoothing(unknowns, smoothness)
 
 
 _EARLY = 100.0

@@ -10,13 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from hks_jax.arrays import StaticArray
 from hks_jax.checks import real_array, require_real
 from hks_jax.domain import spd
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_field import TensorField
+from hks_jax.fem.space import GridSpace
 
 Values = Float[Array, "..."]
 Tensors = Float[Array, "n d d"]
@@ -136,8 +137,8 @@ class Unknowns(eqx.Module):
     def field(self, values: Values) -> TensorField:
         """Return the field with given parameters."""
 
-    def slopes(self, values: Values) -> list[Float[Array, "c *edges"]]:
-        """Return the parameters' slopes along the grid's edges of each axis, and 0 for edges that leave the domain."""
+    def slopes(self, values: Values) -> Float[Array, "d c *shape"]:
+        """Return the slopes of the parameters from each node to the next along each axis, and 0 outside the domain."""
         raise ValueError(
             "regularisers: got a slope penalty, but the unknowns are parameters of a function and have no slopes on "
             "the grid; expected Prior or LogDeterminant"
@@ -151,6 +152,7 @@ class Nodal(Unknowns):
     init: TensorField  # the initial field, which does not change outside the domain
     # The flat indices of the domain's nodes; the constructor takes the domain, bool (*shape).
     nodes: Any = eqx.field(static=True, converter=lambda domain: StaticArray(np.flatnonzero(domain)))
+    periodic: tuple[bool, ...] = eqx.field(static=True)  # for each axis, whether its last nodes adjoin the first ones
 
     @property
     def _base(self) -> Float[Array, "n d d"]:
@@ -169,18 +171,24 @@ class Nodal(Unknowns):
         full = all_tensors.at[self.nodes.value].set(moved)
         return self.init.with_tensors(full.reshape(self.init.domain_tensors.shape))
 
-    def slopes(self, values: Values) -> list[Float[Array, "c *edges"]]:
-        """Return the parameters' slopes along the grid's edges of each axis, and 0 for edges that leave the domain."""
+    @property
+    def edges(self) -> Bool[np.ndarray, "d *shape"]:
+        """For each axis, whether each node and the next node along the axis are in the domain."""
         grid = self.init.grid
-        domain = np.zeros(grid.size, dtype=bool)
-        domain[self.nodes.value] = True
+        domain = np.isin(np.arange(grid.size), self.nodes.value).reshape(grid.shape)
+        both = np.stack([domain & np.roll(domain, -1, axis) for axis in range(grid.dimension)])
+        for axis, wraps in enumerate(self.periodic):
+            if not wraps:
+                np.moveaxis(both[axis], axis, 0)[-1] = False
+        return both
+
+    def slopes(self, values: Values) -> Float[Array, "d c *shape"]:
+        """Return the slopes of the parameters from each node to the next along each axis, and 0 outside the domain."""
+        grid = self.init.grid
         fields = jnp.zeros((values.shape[1], grid.size), values.dtype).at[:, self.nodes.value].set(values.T)
-        fields, differences = fields.reshape(-1, *grid.shape), []
-        for axis in range(grid.dimension):
-            inside = np.moveaxis(domain.reshape(grid.shape), axis, 0)
-            both = np.moveaxis(inside[1:] & inside[:-1], 0, axis)
-            differences.append(jnp.where(both, jnp.diff(fields, axis=axis + 1) / grid.spacing[axis], 0))
-        return differences
+        fields = fields.reshape(-1, *grid.shape)
+        differences = [(jnp.roll(fields, -1, axis + 1) - fields) / spacing for axis, spacing in enumerate(grid.spacing)]
+        return jnp.where(self.edges[:, None], jnp.stack(differences), 0)
 
 
 class Free(Unknowns):
@@ -222,11 +230,11 @@ class Free(Unknowns):
         return self.init.with_tensors(tensors)
 
 
-def unknowns_for(parametrisation: str | Parametrisation | Free, init: TensorField, domain: np.ndarray) -> Unknowns:
-    """Return the unknowns of a fit that starts from a field."""
+def unknowns_for(parametrisation: str | Parametrisation | Free, init: TensorField, space: GridSpace) -> Unknowns:
+    """Return the unknowns of a fit that starts from a field, at the nodes of the space."""
     if isinstance(parametrisation, Free):
         return Free(parametrisation.function, parametrisation.parameters, init)
-    if isinstance(parametrisation, Parametrisation):
-        return Nodal(parametrisation, init, domain)
-    others = "a Parametrisation, or Free(function, parameters)"
-    return Nodal(named("parametrisation", parametrisation, PARAMETRISATIONS, others), init, domain)
+    chosen, others = parametrisation, "a Parametrisation, or Free(function, parameters)"
+    if not isinstance(chosen, Parametrisation):
+        chosen = named("parametrisation", chosen, PARAMETRISATIONS, others)
+    return Nodal(chosen, init, space.domain, space.periodic)

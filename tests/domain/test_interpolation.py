@@ -10,7 +10,7 @@ from fields import random_spd, turning
 from scipy.linalg import expm, logm
 
 import hks_jax as hj
-from hks_jax.inverse.unknowns import PARAMETRISATIONS, Nodal
+from hks_jax.inverse.unknowns import unknowns_for
 
 LOG = "log-euclidean"
 
@@ -136,7 +136,7 @@ def test_whatever_rebuilds_a_field_keeps_its_interpolation(rng):
         hj.reflect(hj.TensorField(grid, D, LOG), 2),
     ):
         assert field.interpolation == LOG
-    nodal = Nodal(PARAMETRISATIONS[LOG], hj.TensorField(grid, D, LOG), grid.inside)
+    nodal = unknowns_for(LOG, hj.TensorField(grid, D, LOG), hj.assemble(hj.TensorField(grid, D, LOG)).space)
     assert nodal.field(nodal.start()).interpolation == LOG
     assert hj.TensorField(grid, D).interpolation == "linear"
     for make in (hj.TensorField, lambda g, t, i: hj.TensorField.from_diffusion(g, t, "tensor", interpolation=i)):

@@ -13,7 +13,7 @@ import hks_jax as hj
 from hks_jax.inverse.conformal import conformal_information
 from hks_jax.inverse.gauss_newton import GaussNewton
 from hks_jax.inverse.search import choose_inner_product
-from hks_jax.inverse.unknowns import PARAMETRISATIONS, Nodal
+from hks_jax.inverse.unknowns import unknowns_for
 from hks_jax.linear import conjugate_gradients
 
 
@@ -123,8 +123,8 @@ def test_no_step_is_chosen_where_what_was_taken_will_do():
 def preconditioner(field, times):
     """Return the unknowns, the inner product and the inverse of the preconditioner as a function of damping."""
     space = hj.assemble(field).space
-    unknowns = Nodal(PARAMETRISATIONS["conformal"], field, space.domain)
-    mass = choose_inner_product(unknowns, 0.0, None, space.periodic)
+    unknowns = unknowns_for("conformal", field, space)
+    mass = choose_inner_product(unknowns, 0.0, None)
     information = conformal_information(unknowns, mass, jnp.asarray(times))
     eye = jnp.eye(unknowns.start().size)
 

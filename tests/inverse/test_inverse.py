@@ -27,7 +27,7 @@ from hks_jax.inverse import (
 from hks_jax.inverse.observation import LOSSES, observe
 from hks_jax.inverse.problem import Problem, more_pairs, outcome_of, truncation_shows
 from hks_jax.inverse.signature import SIGNATURES, pairs_for
-from hks_jax.inverse.unknowns import PARAMETRISATIONS, Nodal
+from hks_jax.inverse.unknowns import PARAMETRISATIONS, unknowns_for
 
 N = 10
 GRID = hj.Grid((N, N), 1 / (N - 1))
@@ -51,7 +51,7 @@ def signature(field, k=K, times=TIMES):
 def problem_of(target, times, init, k, weights=None):
     """The problem of a fit of conformal factors, without the fit."""
     space = hj.assemble(init).space
-    unknowns = Nodal(PARAMETRISATIONS["conformal"], init, space.domain)
+    unknowns = unknowns_for("conformal", init, space)
     observation, _ = observe(target, times, Data(weights=weights), space, np.float64)
     return Problem(unknowns, observation, (), k, "neumann", "dense")
 
@@ -296,7 +296,7 @@ def test_penalties_are_means_over_the_domain():
     grid = hj.Grid((40, 60), (1 / 39, 2 / 59))
     x, y = grid.nodes[..., 0], grid.nodes[..., 1]
     flat = hj.TensorField(grid, np.broadcast_to(np.eye(2), (40, 60, 2, 2)))
-    unknowns = Nodal(PARAMETRISATIONS["conformal"], flat, grid.inside)
+    unknowns = unknowns_for("conformal", flat, hj.assemble(flat).space)
     values = jnp.asarray((3 * x + 2 * y).reshape(-1, 1))
     field = unknowns.field(values)
 
@@ -311,6 +311,21 @@ def test_penalties_are_means_over_the_domain():
     assert penalty(H1(0.5)) == pytest.approx(0.25 * 13, rel=0.03)
     assert penalty(TotalVariation(0.5, 0.01)) == pytest.approx(0.5 * np.sqrt(13), rel=0.03)
     assert all(penalty(each) == 0 for each in (Prior(1.0, field), LogDeterminant(1.0, field)))
+
+
+@pytest.mark.parametrize("penalty", [H1(0.5), TotalVariation(0.5)])
+def test_slopes_across_a_periodic_seam_count_as_all_others(penalty, rng):
+    flat = hj.TensorField(hj.Grid((6, 5)), np.tile(np.eye(2), (6, 5, 1, 1)))
+    values = rng.standard_normal((6, 5, 1))
+
+    def size(values, boundary):
+        unknowns = unknowns_for("conformal", flat, hj.assemble(flat, boundary).space)
+        values = jnp.asarray(values.reshape(-1, 1))
+        return jnp.sum(penalty.residuals(unknowns, values, unknowns.field(values)) ** 2)
+
+    whole = size(values, ("periodic", "neumann"))
+    np.testing.assert_allclose(size(np.roll(values, 2, axis=0), ("periodic", "neumann")), whole, rtol=1e-12)
+    assert whole > size(values, "neumann")
 
 
 @pytest.mark.slow
@@ -386,11 +401,11 @@ def test_only_nodes_inside_the_mask_count_in_a_penalty(penalty):
     mask[:2, :2] = False
     whole = hj.TensorField(hj.Grid((5, 5)), np.tile(3 * np.eye(2), (5, 5, 1, 1)))
     field = hj.TensorField(hj.Grid((5, 5), mask=mask), np.tile(np.eye(2), (5, 5, 1, 1)))
-    unknowns = Nodal(PARAMETRISATIONS["conformal"], field, mask)
+    unknowns = unknowns_for("conformal", field, hj.assemble(field).space)
     residuals = penalty(2.0, whole).residuals(unknowns, unknowns.start(), field)
     factor = 4 if penalty is LogDeterminant else 2
     np.testing.assert_allclose(jnp.sum(residuals**2) / 2, factor * np.log(3) ** 2, rtol=1e-12)
-    unknowns = Nodal(PARAMETRISATIONS["conformal"], whole, np.ones((5, 5), bool))
+    unknowns = unknowns_for("conformal", whole, hj.assemble(whole).space)
     with pytest.raises(ValueError, match=r"prior: got a field on Grid\(.*21 of 25 nodes\); expected tensors at all"):
         penalty(2.0, field).residuals(unknowns, unknowns.start(), whole)
 

@@ -10,7 +10,7 @@ from hks_jax.eigen.adjoints.factorised_adjoint import FactorisedAdjoint
 from hks_jax.inverse import Data
 from hks_jax.inverse.observation import observe
 from hks_jax.inverse.problem import Problem
-from hks_jax.inverse.unknowns import PARAMETRISATIONS, Nodal
+from hks_jax.inverse.unknowns import unknowns_for
 
 GRID, TIMES, K = hj.Grid((20, 18), 1 / 19), np.geomspace(0.02, 2.0, 4), 28
 X, Y = GRID.nodes[..., 0], GRID.nodes[..., 1]
@@ -24,7 +24,7 @@ def residuals_with(tolerance, boundary="neumann", signature="hks"):
     target = pairs.eigenvalues if signature == "eigenvalues" else 2 * hj.hks(pairs, TIMES)
     target = np.where(np.isfinite(target) & (target > 0), target, 1.0)
     observed, _ = observe(target, TIMES, Data(signature, "log" if signature == "hks" else "absolute"), space, float)
-    unknowns = Nodal(PARAMETRISATIONS["log-euclidean"], FIELD, space.domain)
+    unknowns = unknowns_for("log-euclidean", FIELD, space)
     solver = hj.BlockLanczos(adjoint=FactorisedAdjoint(tolerance))
     problem = Problem(unknowns, observed, (), K, boundary, solver)
     return lambda values: problem.residuals(values)[0], unknowns.start(), problem
