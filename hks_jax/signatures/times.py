@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from hks_jax.checks import checked_times, require_count
 from hks_jax.compilation import library_of, numpy_where_known
@@ -124,19 +124,33 @@ def suitable(metric: Any, spacing: Any, inside: Bool[np.ndarray, "*shape"], boun
     """
     metric, spacing = np.asarray(metric), np.asarray(spacing)
     d, share = len(spacing), inside.sum() / len(metric)
-    boxes = scipy.ndimage.find_objects(label_nodes(inside, (False,) * d)[0].astype(int))
-    steps = np.array([[part.stop - part.start - 1 for part in box] for box in boxes])  # the length of each component
+    sides = normalise_boundary(boundary, d)
+    periodic = tuple(pair == ("periodic", "periodic") for pair in sides[:-1])
+    labels, count = label_nodes(inside, periodic)
+    steps = np.stack([_steps(labels, count, axis, wraps) for axis, wraps in enumerate(periodic)], axis=1)
     along = np.einsum("naa->na", metric) * spacing**2  # the squared distance of neighbours along each axis
     volume = float(np.sqrt(np.linalg.det(metric)).sum() * np.prod(spacing) * share)
     size = float(np.sqrt((np.median(along, axis=0) * steps**2).max()))
-    sides = normalise_boundary(boundary, d)
-    periodic = tuple(pair == ("periodic", "periodic") for pair in sides[:-1])
     rim = boundary_nodes(active_elements(inside, periodic), periodic)
-    width = np.sqrt(np.median(along, axis=0))
-    depth = float(np.median(scipy.ndimage.distance_transform_edt(~rim, width)[inside])) if rim.any() else math.inf
+    beyond = [(n // 2,) * 2 if wraps else (0, 0) for n, wraps in zip(inside.shape, periodic, strict=True)]
+    to_rim = scipy.ndimage.distance_transform_edt(np.pad(~rim, beyond, "wrap"), np.sqrt(np.median(along, axis=0)))
+    within = tuple(slice(low, low + n) for (low, _), n in zip(beyond, inside.shape, strict=True))
+    depth = float(np.median(to_rim[within][inside])) if rim.any() else math.inf
     problems = len(doubled_problems(sides))
     spacing2, nodes = float(np.median(along.max(axis=1))), round(len(metric) * share)
     return suitable_times(d, volume, spacing2, size, nodes, problems, depth)
+
+
+def _steps(labels: Int[np.ndarray, "*shape"], count: int, axis: int, wraps: bool) -> Float[np.ndarray, " count"]:
+    """Return the extent of each labelled component along an axis, in node spacings.
+
+    The extent around a periodic axis is half of the period: a circle's first eigenvalue is that of half its length.
+    """
+    n = labels.shape[axis]
+    filled = np.zeros((count + 1, n), bool)
+    filled[labels, np.arange(n).reshape([-1 if a == axis else 1 for a in range(labels.ndim)])] = True
+    planes = filled[1:].sum(axis=1)
+    return np.where(wraps & (planes == n), n / 2, planes - 1)
 
 
 def suitable_times(

@@ -9,6 +9,7 @@ from fields import flat
 import hks_jax as hj
 from hks_jax.signatures.rim import free_share, half_free, influence_of
 from hks_jax.signatures.spans import resolved_span
+from hks_jax.signatures.times import LAST, suitable
 
 STRIP = (("neumann", "periodic"), ("dirichlet", "periodic"), (("neumann", "dirichlet"), "periodic"))
 
@@ -111,3 +112,21 @@ def test_a_constant_potential_does_not_change_the_influence_of_the_boundary(stri
     plain, potential = (hj.eigenpairs(hj.assemble(strip, "mean", **own), 40) for own in ({}, {"potential": 50.0}))
     t = jnp.array([0.2, 0.5])
     np.testing.assert_allclose(influence_of(potential, t), influence_of(plain, t), atol=1e-9)
+
+
+def test_times_that_suit_a_domain_do_not_depend_on_the_seam_of_a_periodic_axis():
+    mask = np.zeros((24, 15), bool)
+    mask[4:20, 3:12] = True
+    metric, around = np.tile(np.diag([4.0, 1.0]), (mask.sum(), 1, 1)), ("periodic", "neumann")
+
+    def times(mask, boundary):
+        found = suitable(metric, (0.5, 1.0), mask, boundary)
+        return found["time_by_size"], found["largest_time"]
+
+    np.testing.assert_allclose(times(np.roll(mask, 10, axis=0), around), times(mask, "neumann"), rtol=1e-12)
+    band = np.zeros((24, 15), bool)
+    band[:, 3:12] = True
+    metric = np.tile(np.diag([4.0, 1.0]), (band.sum(), 1, 1))
+    # A circle of length 24 has the first eigenvalue (π/12)², that of an interval of length 12.
+    assert times(band, around)[0] == pytest.approx(LAST * (12 / np.pi) ** 2)
+    assert times(band, "neumann")[0] == pytest.approx(LAST * (23 / np.pi) ** 2)
