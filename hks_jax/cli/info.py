@@ -5,7 +5,7 @@ its connected components, the eigenvalues, the number of tensors that are not po
 The command also asks questions if the frame or a unit looks wrong. For a mesh of triangles or tetrahedra
 ({meshes}, or a FreeSurfer surface), it gives the size, the boundary, the connected components, the arrays at vertices
 and cells, and suitable k and t.
-For a result of another command, it gives the times and settings, and the commands that draw the result.
+For saved eigenpairs, it gives their number and settings. For a result of another command, it gives the times and settings, and the commands that draw the result.
 
 examples:
   hks-jax info tensor.nii.gz --mask mask.nii.gz
@@ -25,7 +25,7 @@ import numpy as np
 from hks_jax.cli import options
 from hks_jax.cli.computation import times_in_words
 from hks_jax.cli.meshes import describe_mesh
-from hks_jax.cli.pairs import arrays_in
+from hks_jax.cli.pairs import arrays_in, facts_of, is_saved_pairs
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import Reading, outside_note, read, without_element
 from hks_jax.domain.components import label_nodes
@@ -57,6 +57,9 @@ def run(args: argparse.Namespace, progress: Progress) -> None:
         raise ValueError(f"FILE: got {1 + len(args.others)} files; expected one result or mesh")
     if result is not None:
         description = _describe_result(result)
+    elif is_saved_pairs(args.file):
+        use = f"hks-jax hks {shlex.quote(str(args.file))} -o OUT --times auto:8"
+        description = {"file": str(args.file), **facts_of(args.file), "for a signature": use}
     elif is_mesh(args.file):
         found = load_mesh(args.file, args.clean)
         description = {"file": str(args.file), **describe_mesh(args.file, found.mesh), "arrays": listed(found.arrays)}

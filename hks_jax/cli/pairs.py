@@ -56,6 +56,19 @@ def are_of(path: Path, fingerprint: str) -> bool:
         return bool(json.loads(str(arrays[_RECORD]))["fingerprint"] == fingerprint)
 
 
+def facts_of(path: Path) -> dict[str, Any]:
+    """Return facts about saved eigenpairs: their number, the range of eigenvalues, and the settings."""
+    arrays = load_npz(path)
+    record, values = json.loads(str(arrays[_RECORD])), arrays["eigenvalues"]
+    return {
+        "eigenpairs": values.size,
+        "eigenvalues": [float(values[0]), float(values[-1])],
+        "shape": arrays["tensors"].shape[:-2],
+        **{name: value for name, value in record["settings"].items() if value},
+        "warnings": record["warnings"],
+    }
+
+
 def read_pairs(path: Path, settings: Settings, progress: Progress) -> Solved:
     """Return saved eigenpairs; settings in the file replace settings in `settings`."""
     arrays = load_npz(path)

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from hks_jax.domain.grid import per_axis
 from hks_jax.io.tensor_order import Matrices, matrices, to_voxel_axes
+from hks_jax.io.units import in_mm2_per_s, unit_in
 from hks_jax.io.volume import Format, TensorVolume, describe_tensors, mask_in_file
 from hks_jax.storage import load_npy, load_npz, write_npz
 
@@ -61,8 +62,9 @@ def _read_tensors(
 def volume_of(name: str, arrays: Mapping[str, Any], tensors: Float[np.ndarray, "..."], **about: Any) -> TensorVolume:
     """Return a volume of `tensors` with the arrays of `place_of`; by default, spacing is 1 and origin is 0."""
     mask, affine, axis = (arrays.get(name) for name in ("mask", "affine", "slice_axis"))
-    d = tensors.shape[-1] if tensors.ndim else 0
-    return TensorVolume(
+    d, text = tensors.shape[-1] if tensors.ndim else 0, _text(arrays, "unit")
+    unit = unit_in(text)
+    volume = TensorVolume(
         tensors,
         per_axis(f"{name}: spacing", arrays.get("spacing", 1.0), d),
         per_axis(f"{name}: origin", arrays.get("origin", 0.0), d),
@@ -70,9 +72,10 @@ def volume_of(name: str, arrays: Mapping[str, Any], tensors: Float[np.ndarray, "
         None if affine is None else _real(f"{name}: affine", affine),
         None if axis is None else np.asarray(axis).tolist(),
         length_unit=_text(arrays, "length_unit"),
-        unit=_text(arrays, "unit"),
+        unit=text if unit is None else "",
         **about,
     )
+    return volume if unit is None else in_mm2_per_s(volume, unit, "which the file declares")
 
 
 def _write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:

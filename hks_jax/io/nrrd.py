@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.io.repair import require_symmetric
 from hks_jax.io.tensor_order import matrices, nearest_rotation, pack, shear_notes, to_voxel_axes
 from hks_jax.io.units import millimetres
@@ -198,6 +199,8 @@ def _store(path: Path, array: np.ndarray, volume: TensorVolume, record: str, kin
     """
     nrrd = optional("nrrd")
     placed = volume.affine is not None and not kind.startswith("2D")
+    if volume.affine is not None and not placed:
+        warn_of_accuracy(f"{path.name}: NRRD has no position in space for 2×2 tensors. Use .npz or .vti to keep it")
     if placed:
         d, linear, origin = 3, volume.volume_affine[:3, :3], volume.volume_affine[:3, 3]
     else:

@@ -218,7 +218,7 @@ class Uncertainty(eqx.Module):
         if (share := float(self.indefinite)) > INDEFINITE:
             return [
                 f"intervals are not reliable, because noise makes {share:.2%} of the tensors indefinite. Smooth the "
-                "tensors (smoothing=), or leave the noisiest nodes out of the mask"
+                "tensors (smoothing=, or hks-jax smooth), or leave the noisiest nodes out of the mask"
             ]
         found = []
         if (share := float(self.raised)) > 0:
@@ -233,7 +233,7 @@ class Uncertainty(eqx.Module):
             *found,
             f"intervals are not reliable for {int((~claimed).sum())} of {claimed.size} numbers or maps: the effect of "
             "noise is not linear, or the bias exceeds the deviation (see `trusted`). Only a part of the bias is "
-            "corrected there. Smooth the tensors (smoothing=)",
+            "corrected there. Smooth the tensors (smoothing=, or hks-jax smooth)",
         ]
 
     def summary(self) -> str:

@@ -741,6 +741,9 @@ def test_saved_pairs_give_the_signature_of_other_times_without_another_computati
         capsys.readouterr()
         assert run(kept, "again", ["2e4"], "-k", "5") == 2
         assert "-k: " in capsys.readouterr().err
+        assert main(["info", str(kept), "--json"]) == 0
+        facts = json.loads(capsys.readouterr().out)
+        assert (facts["eigenpairs"], facts["shape"], facts["boundary"]) == (8, [9, 8], boundary)
 
 
 def test_pairs_of_another_pencil_are_refused(tmp_path):

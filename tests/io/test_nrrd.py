@@ -232,6 +232,11 @@ def test_a_plane_field_round_trip(tmp_path):
     assert (read.spacing, read.origin, read.affine) == (plane.spacing, plane.origin, None)
 
 
+def test_the_lost_position_of_a_slice_is_told(tmp_path, volume):
+    with pytest.warns(hj.AccuracyWarning, match=r"t\.nrrd: NRRD has no position in space for 2×2 tensors"):
+        save_tensors(tmp_path / "t.nrrd", volume.slice("y", 2))
+
+
 @pytest.mark.parametrize("sliced", [False, True])
 def test_results_lie_where_the_tensors_do(tmp_path, volume, sliced):
     where = volume.slice("y", 2) if sliced else volume

@@ -173,6 +173,14 @@ def test_a_wrong_unit_is_asked_about_and_can_be_told(tmp_path, unit, scale, dtyp
             read_tensors(tmp_path / name, unit=unit)
 
 
+@pytest.mark.parametrize(("unit", "scale"), [("mm2/s", 1.0), ("um2/ms", 1e-3), ("mm^2/s", 1.0)])
+def test_the_unit_in_an_npz_has_the_name_that_the_argument_has(tmp_path, unit, scale):
+    np.savez(tmp_path / "t.npz", tensors=np.broadcast_to(D / scale, (*SHAPE, 3, 3)), unit=unit, length_unit="mm")
+    read = read_tensors(tmp_path / "t.npz")
+    np.testing.assert_allclose(read.tensors[0, 0, 0], D)
+    assert read.unit == "mm²/s"
+
+
 def test_nothing_is_asked_where_nothing_can_be_said(tmp_path):
     assert questions(read_tensors(write(tmp_path / "t.nii", "mm", 2.0))) == ()
     odd = questions(read_tensors(write(tmp_path / "t.nii", "mm", 2.0, 1e4)))
