@@ -5,7 +5,8 @@ its connected components, the eigenvalues, the number of tensors that are not po
 The command also asks questions if the frame or a unit looks wrong. For a mesh of triangles or tetrahedra
 ({meshes}, or a FreeSurfer surface), it gives the size, the boundary, the connected components, the arrays at vertices
 and cells, and suitable k and t.
-For saved eigenpairs, it gives their number and settings. For a result of another command, it gives the times and settings, and the commands that draw the result.
+For saved eigenpairs, it gives their number and settings. For a result of another command, it gives the times and
+settings, and the commands that draw the result.
 
 examples:
   hks-jax info tensor.nii.gz --mask mask.nii.gz
