@@ -53,10 +53,10 @@ def read_domain(mesh_file: MeshFile, settings: Settings, progress: Progress) -> 
 
     Without tensors, the mesh has the Euclidean metric.
     """
+    volume = None if mesh_file.around is None else read(mesh_file.around, progress)
+    if volume is not None:
+        require_valid(volume, "--repair")
     with progress.stage("reading", str(mesh_file.file)):
-        volume = None if mesh_file.around is None else read(mesh_file.around, progress)
-        if volume is not None:
-            require_valid(volume, "--repair")
         use_dtype(settings.dtype)
         return _with_metric(mesh_file, volume, settings, progress)
 
