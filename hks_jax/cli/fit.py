@@ -29,9 +29,10 @@ from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.parsing import boundary_conditions, weight
 from hks_jax.cli.progress import Progress
 from hks_jax.domain import spd
-from hks_jax.io import ORDERS, read_tensors, save, save_tensors
+from hks_jax.io import read_tensors, save, save_tensors
 from hks_jax.io.formats import format_of
 from hks_jax.io.json_files import tuples
+from hks_jax.io.plausibility import reviewed
 from hks_jax.io.repair import describe_invalid, invalid_in
 from hks_jax.io.result import Result
 from hks_jax.io.volume import TensorVolume, digest, require_position
@@ -61,10 +62,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="the operator of the target, as for 'hks-jax hks' (default: the operator in TARGET, otherwise "
         "laplace-beltrami). With fick, tensors.npz contains the diffusivity D",
     )
-    parser.add_argument(
-        "--order", choices=tuple(ORDERS), help="order of the components in --init, if the file does not declare it"
+    options.add_conventions(
+        parser.add_argument_group("meaning of the numbers in --init", "needed only if the file does not declare it.")
     )
-    options.add_interpolation(parser)
+    parser.add_argument(
+        "--interpolation",
+        choices=("linear", "log-euclidean"),
+        help="the interpolation of the metric between nodes (default: the interpolation in TARGET, otherwise linear)",
+    )
     parser.add_argument(
         "--parametrisation",
         choices=("log-euclidean", "cholesky", "conformal", "eigenvalues", "rotation"),
@@ -152,7 +157,8 @@ def writes(args: argparse.Namespace) -> list[Path]:
 def run(args: argparse.Namespace, progress: Progress) -> Done:
     """Run the command."""
     if args.init is None:
-        refuse(args, ("metric", "order"), "this option describes the tensors in --init, which is missing; pass both")
+        of_init = ("metric", "order", "frame", "unit")
+        refuse(args, of_init, "this option describes the tensors in --init, which is missing; pass both")
     from hks_jax import fit_metric
     from hks_jax.inverse import H1, Data, Search, TotalVariation
     from hks_jax.inverse.metric_fit import RESULTS
@@ -166,6 +172,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
                 "Compute it by 'hks-jax hks' without --normalisation"
             )
         args.operator = args.operator or target.settings.get("operator", "laplace-beltrami")
+        args.interpolation = args.interpolation or target.settings.get("interpolation", "linear")
         require_one_metric(args.metric, args.operator)
         if target.normalisation == "flat":
             target = replace(target, values=target.values / target.to_flat)
@@ -235,7 +242,7 @@ def _initial(args: argparse.Namespace, target: TensorVolume, grid: Grid, progres
     fick = args.operator == "fick"
     if args.metric is None and not fick and format_of(args.init).image:
         raise ValueError(_NO_METRIC)
-    volume = read_tensors(args.init, args.order)
+    volume = read_tensors(args.init, args.order, frame=args.frame, unit=args.unit)
     if args.metric is None and not fick and volume.length_unit:  # of NumPy's files, as in `require_metric`
         raise ValueError(_NO_METRIC)
     if volume.shape != grid.shape:
@@ -254,6 +261,8 @@ def _initial(args: argparse.Namespace, target: TensorVolume, grid: Grid, progres
             "all nodes of the target. Restrict the target to the mask of --init"
         )
     volume = volume.with_mask(grid.mask)
+    for question in reviewed(volume)[1]:
+        progress.warn(f"--init: {question}")
     found = invalid_in(volume)
     if count := int(found.bad.sum()):
         raise ValueError(
@@ -269,9 +278,10 @@ def _write(args: argparse.Namespace, fit: Any, target: Result, report: dict[str,
     from hks_jax.plot import fit_panels, save_figure
     from hks_jax.plot.signature import placed
 
-    tensors = np.asarray(fit.field.domain_tensors)
+    tensors, density = np.asarray(fit.field.domain_tensors), {}
     if args.operator == "fick":
         tensors = spd.inverse(tensors)  # D, in place of the metric D⁻¹
+        density["density"] = np.sqrt(spd.determinant(tensors))
     volume = replace(target.volume, tensors=tensors, order="matrix", frame="voxel")
     volume = replace(volume, source=target.source, digest=digest(target.source), notes=(), unit="")
     history = {"losses": "loss", "misfits": "misfit", "stages": "stage", "starts": "start"}
@@ -282,7 +292,8 @@ def _write(args: argparse.Namespace, fit: Any, target: Result, report: dict[str,
 
     pictures = {"fit.png": draw} if volume.dimension == 2 else {}
     with writing(args.output, report, progress, lambda: [args.output / "fit.png"], pictures) as (folder, done):
-        origin, extra = {"command": sys.argv, "settings": report["settings"]}, {"times": target.times, **columns}
+        origin = {"command": sys.argv, "settings": report["settings"]}
+        extra = {"times": target.times, **density, **columns}
         metric = replace(volume, length_unit="")  # otherwise, the tensors count as diffusion tensors when they are read
         save_tensors(folder / "tensors.npz", metric, provenance=origin)
         save(folder / "fit.npz", np.asarray(fit.hks), volume, name="hks", extra=extra, provenance=origin)

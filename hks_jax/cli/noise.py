@@ -16,7 +16,7 @@ from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import Reading, read_volume
 from hks_jax.io.result import Result
 from hks_jax.io.volume import require_position
-from hks_jax.signatures.times import FREE
+from hks_jax.signatures.times import FREE, positive_range
 
 _CANDIDATES = 4
 """The number of candidate times for each automatic time."""
@@ -39,11 +39,20 @@ class Noise(NamedTuple):
     draws: int
 
 
-def signature_of(solved: Solved, noise: Noise | None, progress: Progress, checkpoint: Path | None = None) -> Result:
-    """Compute the signature of a domain from its eigenpairs, with error bars unless `noise` is None."""
+def signature_of(
+    solved: Solved,
+    noise: Noise | None,
+    progress: Progress,
+    checkpoint: Path | None = None,
+    scaled: np.ndarray | None = None,
+) -> Result:
+    """Compute the signature of a domain from its eigenpairs, with error bars unless `noise` is None.
+
+    If the times are given by the products λ₁t in `scaled`, the times of noisy maps follow the noise of λ₁.
+    """
     settings = solved.settings
     if noise is not None:
-        bars, maps, interior, times = _error_bars(solved, noise, progress, checkpoint)
+        bars, maps, interior, times = _error_bars(solved, noise, progress, checkpoint, scaled)
         settings = replace(settings, times=Times(times, settings.times.automatic))
     result = result_of(solved._replace(settings=settings), progress)
     if noise is None:
@@ -124,7 +133,7 @@ def noise_of(domain: OfVolume | OfMesh, reading: Reading, draws: int, progress: 
 
 
 def _error_bars(
-    solved: Solved, noise: Noise, progress: Progress, checkpoint: Path | None
+    solved: Solved, noise: Noise, progress: Progress, checkpoint: Path | None, scaled: np.ndarray | None
 ) -> tuple[hj.Uncertainty, np.ndarray, np.ndarray, tuple[float, ...]]:
     """Return error bars, the sampled noise (n_draws, n_times, *shape), the interior (n_times, *shape), and the times.
 
@@ -149,7 +158,8 @@ def _error_bars(
             start = found
         if starts and not np.asarray(found.converged).all():
             progress.warn(f"error bars are not accurate: in a noisy map, {found.messages()[0]}")
-        return hj.hks(found, times, settings.normalisation)
+        at = times if scaled is None else jnp.asarray(scaled) / positive_range(found)[0]
+        return hj.hks(found, at, settings.normalisation)
 
     with progress.stage("error bars", f"{noise.draws} noisy maps"), warnings.catch_warnings():
         warnings.simplefilter("ignore", hj.AccuracyWarning)  # some warnings concern candidate times that are not chosen

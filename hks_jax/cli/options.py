@@ -91,19 +91,7 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group(
         "meaning of the numbers", "needed only if the file does not declare it. Wrong axes mirror the tensors."
     )
-    group.add_argument("--order", choices=tuple(ORDERS), help="order of the components")
-    group.add_argument(
-        "--frame",
-        choices=("voxel", "fsl", "world", "measurement"),
-        help="axes of the components: the voxel axes (voxel), the axes of FSL's b-vectors (fsl, for tensors from DIPY "
-        "and FSL), the scanner's axes (world, for MRtrix), or NRRD's measurement frame",
-    )
-    group.add_argument(
-        "--unit",
-        choices=tuple(UNITS),
-        help="unit of the tensors, which are converted to mm2/s. Water in living tissue has about 7e-4 mm2/s, which "
-        "is 0.7 um2/ms, 700 um2/s (TORTOISE) or 7e-10 m2/s. With --bval, the b-values have the reciprocal unit",
-    )
+    add_conventions(group)
     group.add_argument(
         "--array",
         metavar="NAME",
@@ -163,6 +151,23 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
         metavar="B",
         help="largest b-value used, in s/mm2 (default: all are used, with a warning above 1500, up to which the "
         "tensor model holds)",
+    )
+
+
+def add_conventions(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
+    """Add the order, the axes and the unit of the components of tensors."""
+    parser.add_argument("--order", choices=tuple(ORDERS), help="order of the components")
+    parser.add_argument(
+        "--frame",
+        choices=("voxel", "fsl", "world", "measurement"),
+        help="axes of the components: the voxel axes (voxel), the axes of FSL's b-vectors (fsl, for tensors from DIPY "
+        "and FSL), the scanner's axes (world, for MRtrix), or NRRD's measurement frame",
+    )
+    parser.add_argument(
+        "--unit",
+        choices=tuple(UNITS),
+        help="unit of the tensors, which are converted to mm2/s. Water in living tissue has about 7e-4 mm2/s, which "
+        "is 0.7 um2/ms, 700 um2/s (TORTOISE) or 7e-10 m2/s. With --bval, the b-values have the reciprocal unit",
     )
 
 
@@ -376,7 +381,8 @@ def defaults(*groups: Callable[[argparse.ArgumentParser], None]) -> dict[str, An
 COLUMNS = [name.replace("_", "-") for name in defaults(add_reading, add_noise) if name not in FILES]
 """The columns of a table of subjects that have the meaning of the option with the same name."""
 
-_ARGUMENTS = {name: name for name in defaults(add_metric, add_reading, add_solving, add_signature)}
+_ARGUMENTS = {name: name for name in defaults(add_metric, add_reading, add_solving, add_signature, add_noise)}
+_ARGUMENTS |= {name: name for name in ("smoothness", "max_steps", "continuation", "starts", "parametrisation")}
 _ARGUMENTS |= {"iterations": "erode", "level": "noise", "f": "map", "fwhm": "fwhm", "clean": "clean"}
 """The option that gives an argument of the library, by the argument's name in messages."""
 

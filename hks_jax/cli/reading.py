@@ -150,7 +150,9 @@ def read(reading: Reading, progress: Progress, ask: Callable[[str], None] | None
                 raise ValueError(f"--mask: got shape {mask.shape}; expected the shape of the tensors, {volume.shape}")
             volume = volume.with_mask(mask)
         if reading.erode:
-            volume = volume.with_mask(erode(volume.inside, reading.erode))
+            left = erode(volume.inside, reading.erode)
+            note = f"erode: {int(volume.inside.sum() - left.sum())} voxels at the boundary of the mask are left out"
+            volume = replace(volume.with_mask(left), notes=(*volume.notes, note))
         volume = _repaired(volume, reading)
     for note in volume.notes:
         progress.note(with_option(note))

@@ -27,6 +27,8 @@ from hks_jax.storage import atomic_path
 
 _NAME = re.compile(r"[A-Za-z0-9_.-]+")
 """The names of arrays that all formats can hold: PLY has no spaces, Gmsh no quotation marks, VTU no "<"."""
+_CONFIDENCE = 0.5
+"""The confidence above which a voxel is inside the mask, for NRRD's masked kinds."""
 _PLACE = ("spacing", "origin", "mask", "affine", "slice_axis", "length_unit", "unit", "vertices", "faces", "cells")
 
 
@@ -38,7 +40,7 @@ def read_tensors(
     frame: Frame | None = None,
     array: str | None = None,
     spacing: float | Sequence[float] | None = None,
-    confidence: float = 0.5,
+    confidence: float = _CONFIDENCE,
     repair: Repair | None = None,
     unit: Unit | None = None,
 ) -> TensorVolume:
@@ -107,6 +109,8 @@ def read_tensors(
             raise ValueError(f"array: got {array!r}, but only npz and VTK files have named arrays. Leave it out")
         if spacing is not None and "spacing" not in reader.options:
             raise ValueError(f"spacing: {name} declares its spacing; only NumPy's files may lack it. Leave it out")
+        if confidence != _CONFIDENCE and "confidence" not in reader.options:
+            raise ValueError(f"confidence: got {confidence}, but only NRRD's masked tensors have one. Leave it out")
         given = {"array": array, "spacing": spacing, "confidence": confidence}
         volume = reader.read_tensors(name, order, frame, **{option: given[option] for option in reader.options})
         if not name.lower().endswith(".nhdr"):  # the digest of a detached header would not identify the data

@@ -239,7 +239,13 @@ class Result:
     @property
     def to_flat(self) -> Float[np.ndarray, "n_times ..."]:
         """The factor of the normalisation ``"flat"``, which is `flat_scale`, times √|D| for Fick's operator."""
-        return self.flat_scale * self.arrays.get("density", 1.0)
+        if self.settings.get("operator") != "fick":
+            return self.flat_scale
+        if "density" not in self.arrays:
+            raise ValueError(
+                f"{self.source}: the signature of Fick's operator lacks its density √|D|; compute it again"
+            )
+        return self.flat_scale * self.arrays["density"]
 
     @property
     def in_time(self) -> bool:

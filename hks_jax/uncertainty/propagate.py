@@ -181,6 +181,8 @@ def uncertainty(
         method = "exact" if compiled and size <= draws else "resample"
     samples = -(-draws // _BALANCED) if method == "resample" else LEAST // _BALANCED
     moments = _sampled(run, value, measured, noise, seed, samples, progress, checkpoint, each, floor)
+    if checkpoint is not None:  # which may have more samples
+        samples = int(moments.n)
     variance = jax.tree.map(lambda odd: odd / samples, moments.odd)
     spread = jax.tree.map(lambda s: s / (samples - 1), moments.spread)
     freedom: float = samples * (_BALANCED - 1)

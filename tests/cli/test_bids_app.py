@@ -102,6 +102,13 @@ def test_participants_are_jobs_and_the_group_collects(tmp_path, app, monkeypatch
     assert npz.read_bytes() == before[npz.relative_to(out).as_posix()]
 
 
+def test_options_that_no_input_has_a_use_for_are_refused(tmp_path, app, capsys):
+    tree.bep16(tmp_path / "in", "01")
+    assert app("participant", *GIVEN, "--b-max", "700") == 2
+    assert "--b-max: this option is for diffusion-weighted images, but all participants" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.slow
 def test_all_programs_give_the_same_signature(tmp_path, app):
     """Tensors in three conventions, and images to which they are fitted, within the same mask."""

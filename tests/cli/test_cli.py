@@ -16,6 +16,7 @@ import jax
 import nibabel as nib
 import numpy as np
 import pytest
+from fields import random_spd
 
 import hks_jax as hj
 from hks_jax.cli import COMMANDS, build_parser, demo, main
@@ -818,6 +819,22 @@ def test_fit_end_to_end_recovers_the_metric(conformal, tmp_path, capsys):
     assert printed.pop("files") == [str(file) for file in sorted(out.iterdir())]
     assert printed == report
     assert "steps exhausted" in report["warnings"][0]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:k. the truncation:hks_jax.AccuracyWarning")
+def test_a_fit_of_ficks_operator_has_the_interpolation_and_the_density_of_its_target(tmp_path, rng):
+    tensors = random_spd(rng, (7, 6))
+    np.savez(tmp_path / "t.npz", tensors=tensors)
+    source, out, fitted = map(str, (tmp_path / "t.npz", tmp_path / "out", tmp_path / "fitted"))
+    given = ["--operator", "fick", "--interpolation", "log-euclidean", "--times", "0.5", "1", "-k", "42", "-q"]
+    assert main(["hks", source, "-o", out, "--boundary", "neumann", "--solver", "dense", *given]) == 0
+    assert main(["fit", out, "-o", fitted, "--init", source, "--max-steps", "1", "-k", "42", "-q"]) == 0
+    target, fit = Result.read(tmp_path / "out" / "hks.npz"), Result.read(tmp_path / "fitted" / "fit.npz")
+    assert fit.settings["interpolation"] == "log-euclidean"
+    with np.load(tmp_path / "fitted" / "fit.npz") as read:
+        assert read["misfits"][0] < 1e-18
+    np.testing.assert_allclose(fit.values * fit.to_flat, target.values, rtol=1e-6)
 
 
 @pytest.mark.slow

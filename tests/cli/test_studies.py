@@ -11,6 +11,8 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import nibabel as nib
@@ -20,8 +22,10 @@ from annotations import unchecked
 
 import hks_jax as hj
 from hks_jax.cli import build_parser, main
-from hks_jax.cli.computation import Settings
+from hks_jax.cli.computation import Settings, compute_pairs, domain_of_volume
+from hks_jax.cli.noise import Noise, signature_of
 from hks_jax.cli.options import defaults
+from hks_jax.cli.parsing import Times
 from hks_jax.cli.progress import StudyProgress
 from hks_jax.cli.study.folder import Study
 from hks_jax.cli.study.settings import Range, add_kept, common_times, suitable_range
@@ -652,6 +656,37 @@ def test_omitted_options_are_those_of_the_study(study, monkeypatch, capsys):
     assert json.loads((study / "out" / "study.json").read_text())["settings"]["normalisation"] == "flat"
 
 
+def test_what_a_study_keeps_serves_all_its_subjects(study, monkeypatch, capsys):
+    monkeypatch.setattr("hks_jax.cli.study.tasks.run_all", lambda *_: Outcome({}, []))
+    monkeypatch.setattr("hks_jax.cli.study.tasks.write_group", lambda *_: [])
+    monkeypatch.setattr("hks_jax.cli.study.tasks.other_units", lambda *_: {})
+    head, first, *_ = (study / "subjects.tsv").read_text().splitlines()
+    (study / "subjects.tsv").write_text(f"{head}\tnoise\n{first}\t0.1\n")
+    masks = [study / f"mask{i}.npy" for i in range(3)]
+    for i, mask in enumerate(masks):
+        np.save(mask, np.indices(SHAPE)[0] >= max(i - 1, 0))  # the first two are equal
+    short = ["batch", str(study / "subjects.tsv"), "-o", str(study / "out")]
+    own = ["--draws", "16", "--view", "radiological", "--save-pairs", "--mask", str(masks[0]), "--times", "3e3"]
+    assert main(command(study, "out", *own)) == 0
+    record = (study / "out" / "study.json").read_text()
+    picture = study / "out" / "sub-01" / "figures" / "sub-01_model-tensor_param-hks_dwimap.png"
+    picture.parent.mkdir(parents=True)
+    picture.touch()
+    capsys.readouterr()
+    assert main(short) == 0
+    assert (study / "out" / "study.json").read_text() == record
+    assert picture.exists()
+    printed = capsys.readouterr().err
+    for option in ("--draws 16", "--view radiological", "--save-pairs", f"--mask {masks[0]}"):
+        assert option in printed
+    assert main([*short, "--mask", str(masks[1])]) == 0
+    assert main([*short, "--mask", str(masks[2])]) == 2
+    assert f"has --mask {masks[1]}, not {masks[2]}. Leave" in capsys.readouterr().err
+    assert main([*short, "--show-rim"]) == 0
+    assert "the pictures are drawn again for --show-rim" in capsys.readouterr().err
+    assert not picture.exists()
+
+
 @pytest.mark.slow
 def test_a_study_that_keeps_its_pairs_has_other_times_for_nothing_and_to_the_bit(study, monkeypatch):
     monkeypatch.setattr(
@@ -665,7 +700,8 @@ def test_a_study_that_keeps_its_pairs_has_other_times_for_nothing_and_to_the_bit
     kept, direct = contents(study / "kept"), contents(study / "direct")
     assert len(kept.pop("sub-02/dwi/sub-02_model-tensor_param-hks_pairs.npz")) > 8 * 8 * 72
     assert kept == direct
-    # Pairs of other settings are none.
+    # Pairs that a study is to keep, and lacks, are computed; pairs of other settings are none.
+    assert main(command(study, "direct", "--save-pairs", *other)) == 1
     assert main(command(study, "kept", "--replace", "--interpolation", "log-euclidean", *other)) == 1
 
 
@@ -710,6 +746,25 @@ def test_a_study_has_errors_of_regions_and_computes_again_what_had_other_noise(s
     ):
         assert main([*words, *more]) == 2
         assert text in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("scaled", "sees"), [(None, True), (np.array([2.0, 5.0]), False)])
+def test_noise_of_the_first_eigenvalue_changes_times_that_follow_it(scaled, sees):
+    settings = Settings.of(metric="inverse", k=8, boundary="neumann", times=Times((2e4, 5e4), 0))
+    progress = StudyProgress(1, quiet=True, stream=io.StringIO())
+    solved = compute_pairs(domain_of_volume(volume().slice("z", 1), settings), settings, progress)
+    plane = solved.domain.place
+    gain = 0.01 * plane.tensors[..., *np.tril_indices(2)][..., None, :]  # one factor for all tensors
+    noise = Noise(hj.TensorNoise.from_modes(gain, plane.grid()), "gain", 8)
+    if scaled is not None:
+        own = Times(tuple((scaled / float(solved.pairs.eigenvalues[1])).tolist()), 0)
+        solved = solved._replace(settings=replace(settings, times=own))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", hj.AccuracyWarning)  # one mode has hardly any degrees of freedom
+        result = signature_of(solved, noise, progress, scaled=scaled)
+    # Without dimension, HKS depends on λ₁t only, which a factor of all tensors does not change.
+    assert (np.max(result.arrays["deviation"] / result.values) > 1e-3) == sees
+    assert sees or np.max(result.arrays["deviation"]) < 1e-9
 
 
 @pytest.mark.slow

@@ -497,6 +497,10 @@ def test_an_interrupted_computation_goes_on(rng, tmp_path):
     np.testing.assert_array_equal(again[:6], samples)
     np.testing.assert_allclose(np.mean(np.square(again), axis=0), whole.deviation**2, rtol=1e-12)
     np.testing.assert_allclose(resumed.deviation, whole.deviation, rtol=1e-14)
+    fewer = hj.uncertainty(spd.determinant, D, **(settings | {"draws": 8}), each=again.append, **stored)
+    assert fewer.draws == 24  # all that the file has
+    np.testing.assert_array_equal(fewer.deviation, resumed.deviation)
+    np.testing.assert_array_equal(fewer.trusted, resumed.trusted)
     with pytest.raises(ValueError, match="belongs to another computation"):
         hj.uncertainty(spd.determinant, 2 * D, **settings, each=samples.append, **stored)
 

@@ -89,10 +89,23 @@ def run(args: argparse.Namespace, begun: Progress) -> None:
     refuse(args, ("names",) * (args.atlas is None), "this option names labels, which are missing; pass --atlas")
     chosen = dataset.chosen(args.participant_label)
     subjects = find_subjects(dataset, chosen, args)
+    if args.replace or not (args.output / "study.json").is_file():
+        _require_used(args, _all(dataset, subjects, args) if args.participant_label else subjects)
     if args.level != "participant":
         (collect if args.level == "group" else prepare)(args, subjects, begun, note)
     else:
         run_study(args, subjects, lambda: _all(dataset, subjects, args), begun, note, collects=False)
+
+
+def _require_used(args: argparse.Namespace, subjects: list[Subject]) -> None:
+    """Raise ValueError for options of images if no participant has images, and of tensors if all have images."""
+    of_images = [subject.arguments.bval is not None for subject in subjects if subject.arguments is not None]
+    if not any(of_images):
+        why = "this option is for diffusion-weighted images, but all participants have tensors; leave it out"
+        refuse(args, ("bval", "bvec", "b_max", "bvec_frame"), why)
+    elif all(of_images):
+        why = "this option is for tensors, but all participants have diffusion-weighted images; see --bvec-frame"
+        refuse(args, ("frame", "order"), why)
 
 
 def _all(dataset: Dataset, subjects: list[Subject], args: argparse.Namespace) -> list[Subject]:

@@ -50,7 +50,7 @@ class Study:
         settings: the settings of the computation, including the times for all subjects.
         time_unit: ``"scanner"``, or ``"lambda1"`` if the times are products λ₁t.
         reading: the options for reading, which rows of the table may replace.
-        save_pairs: whether the eigenpairs are saved.
+        output: the orientation and the hatching of pictures, and whether eigenpairs are saved, as options.
         files: the paths of files for all subjects, by name of the option, which a repeated command takes.
     """
 
@@ -58,7 +58,7 @@ class Study:
     settings: Settings
     time_unit: str
     reading: Mapping[str, Any]
-    save_pairs: bool = False
+    output: Mapping[str, Any] = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)
 
     def path(self, subject: Subject, ending: str) -> Path:
@@ -85,6 +85,11 @@ class Study:
     def picture(self, subject: Subject) -> Path:
         """Return the path of the picture of a subject's signature."""
         return self.folder / subject.participant / "figures" / f"{subject.name}{MAP}.png"
+
+    def forget_pictures(self) -> None:
+        """Remove all pictures of signatures, which the next commands draw again."""
+        for picture in self.folder.glob(f"*/figures/*{MAP}.png"):
+            picture.unlink(missing_ok=True)
 
     def fingerprint(self, subject: Subject) -> str:
         """Return a digest of all inputs of a subject's signature; raise FileNotFoundError if a file is missing."""
@@ -166,7 +171,7 @@ class Study:
         """The settings that all subjects share, as stored in study.json."""
         settings = asdict(self.settings)
         times = {"times": settings.pop("times")[0], "time-unit": self.time_unit}
-        record: dict[str, Any] = plain({**times, "settings": settings, "reading": self.reading})
+        record: dict[str, Any] = plain({**times, "settings": settings, "reading": self.reading, "output": self.output})
         return record
 
     def require_settings(self) -> None:
@@ -199,9 +204,12 @@ def written_in(folder: Path) -> list[Path]:
     return [folder / name for name in names]
 
 
-def reading_options(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the options for reading and noise; "file" replaces the path of a second scan, because files may move."""
-    names = [option for option in COLUMNS if args.noise is not None or option not in ("noise", "draws")]
+def reading_options(args: argparse.Namespace, every: bool = False) -> dict[str, Any]:
+    """Return the options for reading and noise; "file" replaces the path of a second scan, because files may move.
+
+    Without noise, its options are left out, unless ``every`` is set: subjects may have noise in a column of the table.
+    """
+    names = [option for option in COLUMNS if every or args.noise is not None or option not in ("noise", "draws")]
     reading = {option: getattr(args, option.replace("-", "_")) for option in names}
     return {**reading, "noise": "file"} if is_file(args.noise) else reading
 

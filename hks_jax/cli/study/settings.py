@@ -21,11 +21,16 @@ from hks_jax.cli.study.subjects import Subject
 from hks_jax.io import TensorVolume
 from hks_jax.io.bids import are_entities
 from hks_jax.io.json_files import read_json, tuples
+from hks_jax.io.volume import digest
 from hks_jax.signatures.spans import SHORTEST
 from hks_jax.signatures.times import LAST
 
 ENTITIES = ("select", "mask", "atlas")
 """Options that may select files by BIDS entities, and which a study keeps beside its settings."""
+_STYLE = ("view", "show_rim")
+"""The options of pictures."""
+OUTPUT = (*_STYLE, "save_pairs")
+"""Options that a study keeps, and that change no signature."""
 
 
 def add_kept(parser: argparse.ArgumentParser) -> None:
@@ -44,6 +49,13 @@ def add_kept(parser: argparse.ArgumentParser) -> None:
         "divided by each subject's first positive eigenvalue λ₁. Automatic times are log-spaced over the range that "
         "suits all subjects, and the study keeps them",
     )
+    options.add_view(parser)
+    options.add_rim(parser)
+    parser.add_argument(
+        "--save-pairs",
+        action="store_true",
+        help="save the eigenpairs of each subject, which other --times, --normalisation or --method then reuse",
+    )
 
 
 DEFAULTS = dict.fromkeys(name for name in defaults(add_kept) if name not in FILES)
@@ -56,13 +68,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(**DEFAULTS)
     options.add_atlas(parser)
     options.add_names(parser)
-    options.add_view(parser)
-    options.add_rim(parser)
-    parser.add_argument(
-        "--save-pairs",
-        action="store_true",
-        help="save the eigenpairs of each subject, which other --times, --normalisation or --method then reuse",
-    )
 
 
 def complete(args: argparse.Namespace) -> str:
@@ -85,7 +90,7 @@ def complete(args: argparse.Namespace) -> str:
             value = kept.get(name, usual[name])
             setattr(args, name, [_spelled(name, value)] if name == "times" and value else value)
             if value != usual[name] or (name == "boundary" and not before):
-                taken.append(f"{flag(name)} {_spelled(name, value)}")
+                taken.append(flag(name) if value is True else f"{flag(name)} {_spelled(name, value)}")
     origin = f"of the study in {args.output}" if before else "for all subjects"
     return f"options {origin}: {', '.join(taken) or 'as given, or the defaults'}"
 
@@ -96,7 +101,7 @@ def _options(record: Mapping[str, Any]) -> dict[str, Any]:
         return {}
     times = record["times"] if record["chosen"] == "explicit" else record["chosen"]
     options = {"times": times, "time_unit": record["time-unit"], "operator": "laplace-beltrami"}
-    options |= {**record["settings"], **record["reading"]}
+    options |= {**record["settings"], **record["reading"], **record.get("output", {})}
     return {name.replace("-", "_"): tuples(value) for name, value in options.items()}
 
 
@@ -123,15 +128,22 @@ def open_study(args: argparse.Namespace, subjects: Callable[[], list[Subject]], 
     files = {
         n: str(path if n in ENTITIES and are_entities(str(path)) else path.absolute()) for n, path in given.items()
     }
-    study = Study(args.output, Settings.of(args), args.time_unit, reading_options(args), args.save_pairs, files)
+    output = {name: getattr(args, name) for name in OUTPUT}
+    study = Study(args.output, Settings.of(args), args.time_unit, reading_options(args, True), output, files)
     times = study.settings.times
     before, chosen = read_json(args.output / "study.json"), "explicit" if times.explicit else f"auto:{times.automatic}"
     now, then = _options({**study.record, "chosen": chosen}), _options(before)
-    if before and times.explicit:
-        then["times"] = tuples(before["times"])
+    if before:  # an older version may have kept fewer options
+        then = {**defaults(add_kept), **then} | ({"times": tuples(before["times"])} if times.explicit else {})
     changed = [name for name, value in now.items() if then.get(name) != value]
-    if before and changed and not args.replace:
-        kept = "; ".join(f"{flag(n)} {_spelled(n, then.get(n))}, not {_spelled(n, now[n])}" for n in changed)
+    style, changed = set(changed).intersection(_STYLE), [name for name in changed if name not in OUTPUT]
+    earlier = before.get("files", {})
+    other = [name for name in ("mask", *earlier) if before and _is_other(name, earlier.get(name), files.get(name))]
+    if before and (changed or other) and not args.replace:
+        kept = "; ".join(
+            [f"{flag(n)} {_spelled(n, then.get(n))}, not {_spelled(n, now[n])}" for n in changed]
+            + [f"{flag(n)} {earlier.get(n, 'unset')}, not {files.get(n, 'unset')}" for n in dict.fromkeys(other)]
+        )
         raise ValueError(
             f"--output: the study in {args.output} has {kept}. Leave these options out to continue the study, choose "
             "another folder, or pass --replace to compute the subjects of that study again"
@@ -139,8 +151,20 @@ def open_study(args: argparse.Namespace, subjects: Callable[[], list[Subject]], 
     if times.automatic:
         explicit = _suitable(args, times.automatic, subjects(), progress) if changed else tuple(before["times"])
         study = replace(study, settings=replace(study.settings, times=Times(explicit, 0)))
+    if before and style:
+        study.forget_pictures()
+        progress.end(f"the pictures are drawn again for {' and '.join(sorted(map(flag, style)))}")
     study.write_description(chosen)
     return study
+
+
+def _is_other(name: str, before: str | None, now: str | None) -> bool:
+    """Return whether a file for all subjects is another than before; a file that was moved is not."""
+    if name not in FILES or before == now:
+        return False
+    if before is None or now is None or are_entities(before) or are_entities(now):
+        return True
+    return Path(before).is_file() and Path(now).is_file() and digest(before) != digest(now)
 
 
 def _suitable(

@@ -133,7 +133,7 @@ def _problem(study: Study, subject: Subject) -> str:
         task = _Task.of(study, subject)
     except Exception as error:
         return FAILED + _reason(error)
-    lacking = {kind: why for kind, why in task.lacking().items() if kind != PICTURE}
+    lacking = {kind: why for kind, why in task.lacking().items() if kind not in (PICTURE, PAIRS)}
     last = study.outcome(subject)
     return last if lacking and last.startswith(FAILED) else next(iter(lacking.values()), "")
 
@@ -215,16 +215,19 @@ class _Task(NamedTuple):
         return cls(study, subject, fingerprint, regions)
 
     def lacking(self) -> dict[str, str]:
-        """Return why results, `MAP`, `REGIONS` or `PICTURE`, are to be computed."""
+        """Return why results, `MAP`, `REGIONS`, `PAIRS` or `PICTURE`, are to be computed."""
         wanted = {MAP: self.fingerprint} | ({REGIONS: self.regions} if self.regions else {})
         found = {kind: self.study.lacks(self.subject, kind, fingerprint) for kind, fingerprint in wanted.items()}
         found[PICTURE] = "" if self.study.picture(self.subject).is_file() else ABSENT
+        if self.study.output.get("save_pairs"):
+            kept = self.study.path(self.subject, PAIRS), self.study.pairs_fingerprint(self.subject)
+            found[PAIRS] = "" if are_of(*kept) else ABSENT
         return {kind: why for kind, why in found.items() if why}
 
     def run(self, lacking: Iterable[str], progress: StudyProgress) -> None:
         """Compute the lacking results; draw the picture last, so that results remain if drawing fails."""
         study, subject, result = self.study, self.subject, None
-        if MAP in lacking:
+        if MAP in lacking or PAIRS in lacking:
             result = _compute(study, subject, self.fingerprint, progress)  # removes the picture and table of regions
             lacking = (REGIONS, PICTURE)
         if REGIONS in lacking and self.regions:
@@ -248,18 +251,19 @@ class _Task(NamedTuple):
 def _compute(study: Study, subject: Subject, fingerprint: str, progress: StudyProgress) -> Result:
     study.forget(subject)
     args, reading, solved = subject.args, Reading.of(subject.args), _pairs(study, subject, progress)
-    scaled: dict[str, np.ndarray] = {}
+    scaled = None
     if study.time_unit == "lambda1":
-        scaled["scaled_times"] = np.array(study.settings.times.explicit)
-        own = scaled["scaled_times"] / float(positive_range(solved.pairs)[0])
+        scaled = np.array(study.settings.times.explicit)
+        own = scaled / float(positive_range(solved.pairs)[0])
         solved = solved._replace(settings=replace(solved.settings, times=Times(tuple(own.tolist()), 0)))
     domain, volume = solved.domain, solved.domain.volume
     if args.noise == "residuals" and volume is not None and volume.covariance is None:  # not saved with eigenpairs
         again = read_volume(reading, StudyProgress(1, quiet=True, stream=io.StringIO()))
         domain = replace(domain, volume=again.with_mask(volume.mask))
     noise = noise_of(domain, reading, args.draws, progress)
-    result = signature_of(solved, noise, progress)
-    result = replace(result, arrays={**scaled, **result.arrays})
+    result = signature_of(solved, noise, progress, scaled=scaled)
+    if scaled is not None:
+        result = replace(result, arrays={"scaled_times": scaled, **result.arrays})
     with progress.stage("writing"):
         study.write_signature(subject, fingerprint, result, progress.warnings)
     return result
@@ -273,7 +277,7 @@ def _pairs(study: Study, subject: Subject, progress: StudyProgress) -> Solved:
     kept.unlink(missing_ok=True)
     domain = read_grid(Reading.of(subject.args), study.settings, progress)
     solved = compute_pairs(domain, study.settings, progress)
-    if study.save_pairs:
+    if study.output.get("save_pairs"):
         with progress.stage("writing"):
             write_pairs(kept, solved, progress.warnings, fingerprint)
     return solved
