@@ -206,6 +206,8 @@ def _fits(settings: Colouring, part: Pencil, times: Float[Array, " m"]) -> Array
     low = jnp.asarray(settings.low, times.dtype)
     actual, rounding = bounds(part, low, settings.mass_degree), 1.001
     fits = actual.top <= rounding * settings.top
+    # The expansion is that of [0, `settings.top`] for any spectrum, so its degree suffices for the planned times only.
+    fits &= jnp.max(times) <= rounding * settings.longest
     fits &= jnp.all(actual.reach * jnp.max(times) <= rounding * jnp.asarray(settings.reach, times.dtype))
     fits &= jnp.all(actual.across <= rounding * jnp.asarray(settings.across, times.dtype))
     return fits & (mass_bound(part) * rounding >= low)

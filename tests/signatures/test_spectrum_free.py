@@ -244,6 +244,25 @@ def test_traced_values_need_settings_and_settings_must_fit():
         jax.grad(jax.grad(lambda s: loss(s, method=settings)))(1.0)
 
 
+def constant(n, c=1.0):
+    """The metric c·I on n × n nodes at distances √c."""
+    return hj.TensorField(hj.Grid((n, n)), np.broadcast_to(c * np.eye(2), (n, n, 2, 2)))
+
+
+def test_a_colouring_serves_no_times_beyond_those_planned():
+    """Four times the metric and the time: heat reaches as many nodes as planned, but the degree is too small."""
+    settings = hj.colouring(constant(24), [4.0], mass="lumped")
+
+    @jax.jit
+    def signature(c, times):
+        domain = hj.TensorField(hj.Grid((24, 24)), c * constant(24).tensors)
+        return hj.hks_spectrum_free(domain, times, mass="lumped", method=settings)
+
+    exact = hj.hks_spectrum_free(constant(24, 4.0), [4.0], mass="lumped", method="selected-inversion")
+    np.testing.assert_allclose(signature(4.0, jnp.array([4.0])), exact, atol=1e-4 / (16 * np.pi))
+    assert np.isnan(signature(4.0, jnp.array([16.0]))).all()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["selected-inversion", "colouring"])
 def test_amplified_errors_give_nan(method):
@@ -318,7 +337,7 @@ def test_coefficients_and_poles():
 
 def test_sources_of_a_colour_are_apart_also_around_a_periodic_axis():
     space = GridSpace(hj.Grid((23, 17)), normalise_boundary(("periodic", "neumann"), 2))
-    colours = hj.Colouring((5, 4), 1, 1, 1, 1.0, 1.0, (1.0, 1.0), (0.0, 0.0), (0.0,)).colours(space).value
+    colours = hj.Colouring((5, 4), 1, 1, 1, 1.0, 1.0, (1.0, 1.0), (0.0, 0.0), 1.0, (0.0,)).colours(space).value
     assert set(np.unique(colours)) == set(range(colours.max() + 1))
     for colour in range(colours.max() + 1):
         i, j = np.nonzero(colours == colour)
