@@ -263,6 +263,19 @@ def test_a_colouring_serves_no_times_beyond_those_planned():
     assert np.isnan(signature(4.0, jnp.array([16.0]))).all()
 
 
+def test_a_colouring_serves_no_larger_grid():
+    """One source on 8 nodes has no other source of its colour; on 16 nodes it has one at the distance 8."""
+    settings = hj.colouring(constant(8), [20.0], mass="lumped", slack=1.5)
+    call = partial(hj.hks_spectrum_free, mass="lumped", method=settings)
+    message = r"method: got a Colouring for a grid of the shape \(8, 8\); expected .* the shape \(16, 16\)"
+    with pytest.raises(ValueError, match=message):
+        call(constant(16), [20.0])
+    with pytest.raises(ValueError, match=message):
+        jax.jit(lambda t: call(constant(16), t))(jnp.array([20.0]))
+    exact = hj.hks_spectrum_free(constant(7), [20.0], mass="lumped", method="selected-inversion")
+    np.testing.assert_allclose(call(constant(7), [20.0]), exact, atol=1e-4 / (80 * np.pi))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["selected-inversion", "colouring"])
 def test_amplified_errors_give_nan(method):
@@ -337,7 +350,8 @@ def test_coefficients_and_poles():
 
 def test_sources_of_a_colour_are_apart_also_around_a_periodic_axis():
     space = GridSpace(hj.Grid((23, 17)), normalise_boundary(("periodic", "neumann"), 2))
-    colours = hj.Colouring((5, 4), 1, 1, 1, 1.0, 1.0, (1.0, 1.0), (0.0, 0.0), 1.0, (0.0,)).colours(space).value
+    settings = hj.Colouring((5, 4), 1, 1, 1, 1.0, 1.0, (1.0, 1.0), (0.0, 0.0), (23, 17), 1.0, (0.0,))
+    colours = settings.colours(space).value
     assert set(np.unique(colours)) == set(range(colours.max() + 1))
     for colour in range(colours.max() + 1):
         i, j = np.nonzero(colours == colour)
