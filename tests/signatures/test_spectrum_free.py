@@ -261,6 +261,9 @@ def test_a_colouring_serves_no_times_beyond_those_planned():
     exact = hj.hks_spectrum_free(constant(24, 4.0), [4.0], mass="lumped", method="selected-inversion")
     np.testing.assert_allclose(signature(4.0, jnp.array([4.0])), exact, atol=1e-4 / (16 * np.pi))
     assert np.isnan(signature(4.0, jnp.array([16.0]))).all()
+    with pytest.warns(hj.AccuracyWarning, match=r"method: got a Colouring for times up to 4; .* up to 16, .*all times"):
+        found = hj.hks_spectrum_free(constant(24, 4.0), [16.0], mass="lumped", method=settings)
+    assert np.isnan(found).all()
 
 
 def test_a_colouring_serves_no_larger_grid():
@@ -274,6 +277,27 @@ def test_a_colouring_serves_no_larger_grid():
         jax.jit(lambda t: call(constant(16), t))(jnp.array([20.0]))
     exact = hj.hks_spectrum_free(constant(7), [20.0], mass="lumped", method="selected-inversion")
     np.testing.assert_allclose(call(constant(7), [20.0]), exact, atol=1e-4 / (80 * np.pi))
+
+
+@pytest.mark.parametrize("boundary", ["neumann", "dirichlet"])
+def test_a_colouring_for_another_metric_or_mass_is_told_with_the_remedy(boundary):
+    """On half the metric the spectrum is twice as large. Dirichlet conditions once gave another cause."""
+    settings = hj.colouring(constant(12), [2.0], boundary, mass="lumped")
+    with pytest.warns(hj.AccuracyWarning) as told:
+        found = hj.hks_spectrum_free(constant(12, 0.5), [2.0], boundary, mass="lumped", method=settings)
+    assert np.isnan(found).all()
+    (message,) = [str(each.message) for each in told]
+    assert message.startswith("method: got a Colouring for a domain on which the largest eigenvalue")
+    slack = float(message.split("with a slack ")[1].split(" times")[0])
+    assert 2 <= slack < 2.05
+    wider = hj.colouring(constant(12), [2.0], boundary, mass="lumped", slack=slack)
+    if boundary == "neumann":
+        exact = hj.hks_spectrum_free(constant(12, 0.5), [2.0], mass="lumped", method="selected-inversion")
+        found = hj.hks_spectrum_free(constant(12, 0.5), [2.0], mass="lumped", method=wider)
+        np.testing.assert_allclose(found, exact, atol=1e-4 / (8 * np.pi))
+    else:
+        with pytest.warns(hj.AccuracyWarning, match="a mass with weaker couplings"):
+            hj.hks_spectrum_free(constant(12), [1.0], boundary, method=settings)
 
 
 @pytest.mark.slow
