@@ -12,7 +12,7 @@ from scipy.linalg import expm
 
 import hks_jax as hj
 from hks_jax.signatures import contractions
-from hks_jax.signatures.truncation import beyond, beyond_by_weyl, median_of_shares
+from hks_jax.signatures.truncation import beyond, beyond_by_weyl, median_of_shares, share_of_inverse_squares
 
 
 @pytest.fixture(scope="module")
@@ -141,6 +141,31 @@ def test_default_times_span_the_spectrum(field):
     assert hj.default_times(pairs, 2, 1 - 1e-9)[1] == pytest.approx(float(times[0]))  # not before the first
     with pytest.raises(ValueError, match="decay: got 1"):
         hj.default_times(pairs, 2, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("shape", "boundary", "potential"),
+    [((12, 13), "neumann", None), ((12, 13), "dirichlet", None), ((7, 6, 7), "mean", None), ((12, 13), "neumann", 5.0)],
+)
+def test_the_biharmonic_distance_tells_what_few_pairs_lack(shape, boundary, potential):
+    """The mean over all sources and nodes of the squared distance, against all eigenpairs."""
+    pencil = hj.assemble(flat(shape, (1.0, 1.1, 0.9)), boundary, potential=potential)
+    every = hj.eigenpairs(pencil, sum(part.space.n_dof for part in pencil.parts), solver="dense")
+    assert share_of_inverse_squares(every) == 0
+    inverse = np.square(1 / np.asarray(every.eigenvalues)[every.n_null :])
+    source = (0,) * len(shape)
+    hj.biharmonic_distance(every, source)
+    for k in (10, 60):
+        few = hj.eigenpairs(pencil, k, solver="dense", multiplet="drop")
+        lacks = inverse[int(few.kept.sum()) - every.n_null :].sum() / inverse.sum()
+        assert 0.6 < share_of_inverse_squares(few) / lacks < 1.5
+        if k == 10 or len(shape) == 3:
+            with pytest.warns(
+                hj.AccuracyWarning, match=r"pairs: got .* squared biharmonic distance .* more eigenpairs"
+            ):
+                hj.biharmonic_distance(few, source)
+        else:
+            hj.biharmonic_distance(few, source)
 
 
 @pytest.mark.slow
@@ -484,7 +509,7 @@ def test_batches_and_other_objects_are_refused(field, pairs):
 def test_everything_runs_under_jit(field):
     @jax.jit
     def everything(field, times):
-        pairs = hj.eigenpairs(field, 12, solver="dense")
+        pairs = hj.eigenpairs(field, 16, solver="dense")
         return (
             hj.hks(pairs, times), hj.wks(pairs), hj.scale_invariant_hks(pairs), hj.heat_trace(pairs, times),
             hj.heat_kernel(pairs, times, (4, 4)), hj.diffusion_distance(pairs, times, (4, 4)),
@@ -493,7 +518,7 @@ def test_everything_runs_under_jit(field):
         )  # fmt: skip
 
     times = jnp.array([1.0, 2.0])
-    pairs = hj.eigenpairs(field, 12, solver="dense")
+    pairs = hj.eigenpairs(field, 16, solver="dense")
     traced = everything(field, times)
     np.testing.assert_allclose(traced[0], hj.hks(pairs, times), rtol=1e-10)
     np.testing.assert_allclose(traced[6], hj.biharmonic_distance(pairs, (4, 4)), rtol=1e-8, atol=1e-7)
