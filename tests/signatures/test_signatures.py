@@ -98,6 +98,25 @@ def test_wks_is_a_weighted_mean_of_squares(pairs):
     np.testing.assert_allclose(far, functions[0] ** 2, rtol=1e-9)
 
 
+def test_wks_tells_of_energies_to_which_pairs_are_missing():
+    pencil = hj.assemble(flat((12, 13), (1.0, 1.1)))
+    few, every = (hj.eigenpairs(pencil, k, solver="dense") for k in (40, 156))
+    last, sigma = float(jnp.log(few.eigenvalues[-1])), 0.3
+    highest = last - 2 * sigma
+    for energy, error in ((last - 0.3, 0.1), (last + 0.5, 0.5)):
+        with pytest.warns(
+            hj.AccuracyWarning, match=f"energies: 1 of 2 .* Use energies of at most {highest:.4g}, .* more"
+        ):
+            found = hj.wks(few, [highest, energy], sigma)
+        exact = hj.wks(every, [highest, energy], sigma)
+        assert jnp.max(jnp.abs(found / exact - 1)[1]) > error
+    # The largest energy without a warning; the default energies, also as arguments; every pair; traced energies.
+    np.testing.assert_allclose(found[0], exact[0], rtol=0.1)
+    hj.wks(few)
+    hj.wks(few, *hj.default_energies(few, 30))
+    jax.jit(lambda e: hj.wks(few, e, sigma))(jnp.array([last]))
+
+
 @pytest.mark.slow
 def test_scale_invariance(field, pairs):
     scaled = hj.eigenpairs(hj.TensorField(field.grid, 9.0 * field.tensors), pairs.k)
