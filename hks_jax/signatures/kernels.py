@@ -72,6 +72,9 @@ def scale_invariant_hks(
         times: (n,) log-spaced times; give all domains the same times to compare them at absolute scales. The default
             runs from 4 ln10/λ_last to 4 ln10/λ₁.
 
+    Raises:
+        ValueError: if n_frequencies is not from 1 to n/2 + 1, or if concrete times are not log-spaced.
+
     Examples:
         >>> nine = hj.eigenpairs(hj.TensorField(field.grid, 9 * field.tensors), k=12)
         >>> np.allclose(hj.scale_invariant_hks(nine), hj.scale_invariant_hks(pairs), atol=1e-3)
@@ -84,6 +87,7 @@ def scale_invariant_hks(
         times = 4 * math.log(10.0) / jnp.geomspace(last, first, n_times)
     else:
         times = resolved_times(pairs, times)
+        _require_log_spaced(times)
     if not 1 <= n_frequencies <= times.size // 2 + 1:
         raise ValueError(
             f"n_frequencies: got {n_frequencies}; expected 1 to {times.size // 2 + 1} for {times.size} times"
@@ -92,6 +96,19 @@ def scale_invariant_hks(
     # The derivative d/dτ at t = exp τ is t d/dt, which has a closed form.
     slope = spectral_diagonal(pairs, Derivative(Heat(times), Heat(times))) / signature
     return jnp.abs(jnp.fft.rfft(slope, axis=0))[:n_frequencies] / times.size
+
+
+def _require_log_spaced(times: Float[Array, " n"]) -> None:
+    times = jax.lax.stop_gradient(times)
+    if is_traced(times):
+        return
+    steps = np.diff(np.log(np.asarray(times, np.float64)))
+    # The logarithm of a rounded time t (1 + ε) has the error ε.
+    if steps.size and not np.allclose(steps, np.mean(steps), rtol=1e-3, atol=4 * float(jnp.finfo(times.dtype).eps)):
+        raise ValueError(
+            f"times: got steps of log t from {steps.min():.4g} to {steps.max():.4g}; expected equal steps, which the "
+            "Fourier transform along log t needs. Use np.geomspace"
+        )
 
 
 def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Array, "n_energies *shape"]:

@@ -98,6 +98,18 @@ def test_wks_is_a_weighted_mean_of_squares(pairs):
     np.testing.assert_allclose(far, functions[0] ** 2, rtol=1e-9)
 
 
+def test_scale_invariance_takes_log_spaced_times(pairs):
+    single = hj.eigenpairs(flat((6, 7), (1.0, 1.1)), 42, solver="dense")
+    single = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, single)
+    for given in (pairs, single):
+        for times in (np.geomspace(2.0, 8.0, 300), np.geomspace(8.0, 2.0, 20), [2.0], [2.0, 3.0]):
+            hj.scale_invariant_hks(given, 1, times=times)
+        with pytest.raises(ValueError, match=r"times: got steps of log t from 0.2877 to 0.6931; expected equal steps"):
+            hj.scale_invariant_hks(given, 2, times=[2.0, 4.0, 6.0, 8.0])
+    found = jax.jit(lambda t: hj.scale_invariant_hks(pairs, 2, times=t))(jnp.array([2.0, 4.0, 6.0]))
+    assert np.isfinite(found[:, pairs.space.domain]).all()
+
+
 def test_wks_tells_of_energies_to_which_pairs_are_missing():
     pencil = hj.assemble(flat((12, 13), (1.0, 1.1)))
     few, every = (hj.eigenpairs(pencil, k, solver="dense") for k in (40, 156))
