@@ -92,8 +92,10 @@ def align(pairs: Eigenpairs, reference: Eigenpairs, correspondence: Any, gap: fl
     )
     if len(own) != len(other):
         raise ValueError(f"correspondence: got {len(own)} and {len(other)} landmarks or maps; expected equal numbers")
-    groups, partners = _groups(pairs, gap), _partners(pairs, reference)
-    k, values = pairs.k, np.asarray(jax.lax.stop_gradient(pairs.eigenvalues), np.float64)
+    # Groups, rotations and residuals are constant in derivatives.
+    known, of_reference = jax.lax.stop_gradient((pairs, reference))
+    groups, partners = _groups(known, gap), _partners(known, of_reference)
+    k, values = pairs.k, np.asarray(known.eigenvalues, np.float64)
     rotation, spread, agreement = np.eye(k), np.zeros(k), np.full(k, np.nan)
     undetermined = 0
     for group in range(groups.max(initial=-1) + 1):
@@ -156,12 +158,13 @@ def _partners(pairs: Eigenpairs, reference: Eigenpairs) -> Int[np.ndarray, " k"]
 # A unit vector v = Σ qⱼφⱼ has the residual ‖Kv − λMv‖ in the norm of M⁻¹, which is at most max |λⱼ − λ|.
 def _turned(pairs: Eigenpairs, rotation: Float[np.ndarray, "k k"], spread: Float[np.ndarray, " k"]) -> Eigenpairs:
     """Return the pairs with rotated vectors, and with the residuals that rotating unequal eigenvalues causes."""
-    problems, numbers = [], np.asarray(pairs.problem_numbers)
-    for number, each in enumerate(pairs.problems):
+    problems, known = [], jax.lax.stop_gradient(pairs)
+    numbers = np.asarray(known.problem_numbers)
+    for number, (each, constant) in enumerate(zip(pairs.problems, known.problems, strict=True)):
         places = np.flatnonzero(numbers == number)
         q, apart = np.eye(each.k), np.zeros(each.k)  # pairs of a problem beyond the k of the doubled domain stay
         q[: len(places), : len(places)], apart[: len(places)] = rotation[np.ix_(places, places)], spread[places]
-        mixed = jnp.asarray(apart > np.maximum(1e-6, 10 * np.asarray(each.residuals, np.float64)))
+        mixed = jnp.asarray(apart > np.maximum(1e-6, 10 * np.asarray(constant.residuals, np.float64)))
         larger = jnp.maximum(each.residuals, jnp.asarray(apart, each.residuals.dtype))
         residuals, converged = jnp.where(mixed, larger, each.residuals), each.converged & ~mixed
         frame = matmul(jnp.asarray(q, each.frame.dtype), each.frame)

@@ -19,7 +19,7 @@ from hks_jax.signatures.spectral_functions import (
     spectral_squared_distances,
 )
 from hks_jax.signatures.times import dimension_of, positive_range, volume_of
-from hks_jax.signatures.truncation import resolved_times, truncated_share
+from hks_jax.signatures.truncation import TAIL_LIMIT, resolved_times, share_of_inverse_squares, truncated_share
 from hks_jax.traced import is_traced
 
 
@@ -47,14 +47,22 @@ def biharmonic_distance(pairs: Eigenpairs, sources: Any) -> Float[Array, "n_sour
 
     The unit is (metric length)^(2 − d/2). The result is NaN outside the mask.
 
+    The sum is over the computed pairs, so the result is too small. With 24 pairs on a square of 24 × 24 nodes, the
+    median node lacks 1 % of its distance, and nodes beside the source lack 20 to 80 %. In 3D the terms decay slowly:
+    with 100 pairs on a cube of 8 × 8 × 8 nodes, the median node lacks 6 %.
+
     Args:
         sources: node indices (n_sources, d), or (d,) for one source; vertex numbers on a mesh.
 
     Raises:
         ValueError: if a source is outside the domain, if the domain is not connected, or if no eigenvalue is positive.
 
+    Warns:
+        AccuracyWarning: if the mean over the domain of the squared distance lacks more than 1 %, by Weyl's law. No
+            warning is issued if values are traced, or if the dimension of the manifold is not known.
+
     Examples:
-        >>> d = hj.biharmonic_distance(pairs, [(0, 0), (8, 8)])
+        >>> d = hj.biharmonic_distance(hj.eigenpairs(field, k=25), [(0, 0), (8, 8)])
         >>> print(d[0, 0, 0], jnp.isclose(d[0, 8, 8], d[1, 0, 0]))  # to itself; there and back
         0.0 True
     """
@@ -67,7 +75,20 @@ def biharmonic_distance(pairs: Eigenpairs, sources: Any) -> Float[Array, "n_sour
             "expected one component. Compute the eigenpairs of each component separately"
         )
     positive_range(pairs)
+    _warn_of_truncation(jax.lax.stop_gradient(pairs))
     return _distance(pairs, Power(jnp.full(1, -2.0, pairs.eigenvalues.dtype)), sources)[0]
+
+
+# The mean of (φᵢ(x) − φᵢ(y))² over x and y is 2/volume for each i, so the mean of the squared distance is proportional
+# to the sum of all 1/λᵢ².
+def _warn_of_truncation(pairs: Eigenpairs) -> None:
+    if is_traced((pairs.eigenvalues, pairs.kept, pairs.next_eigenvalue)) or pairs.space.dimension is None:
+        return
+    if (left := share_of_inverse_squares(pairs)) > TAIL_LIMIT:
+        warn_of_accuracy(
+            f"pairs: got {pairs.k}; on average over the domain, an estimated {left:.1%} of the squared biharmonic "
+            "distance lies beyond them (several times as much near a source). Use more eigenpairs"
+        )
 
 
 def _distance(pairs: Eigenpairs, filters: Filter, sources: Any) -> Float[Array, "m s *shape"]:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.arrays import nan_is_meant
-from hks_jax.checks import checked_times, real_array, require_real
+from hks_jax.checks import checked_times, real_array, require_real, require_static
 from hks_jax.domain.tensor_field import TensorField, require_field
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.signatures.filters import Heat
@@ -92,13 +92,13 @@ def tensor_invariants(field: TensorField) -> dict[str, Float[np.ndarray, "*shape
 
     Raises:
         TypeError: if the argument is not a tensor field.
+        ValueError: if the field is traced.
 
     Examples:
         >>> {name: round(float(values[4, 4]), 3) for name, values in hj.tensor_invariants(field).items()}
         {'trace': 5.0, 'determinant': 4.0, 'anisotropy': 0.6}
     """
-    require_field(field)
-    tensors = np.asarray(field.domain_tensors, np.float64)
+    tensors = _known_tensors(field)
     d = field.grid.dimension
     trace = np.trace(tensors, axis1=-2, axis2=-1)
     deviator = tensors - trace[..., None, None] / d * np.eye(d)
@@ -106,6 +106,13 @@ def tensor_invariants(field: TensorField) -> dict[str, Float[np.ndarray, "*shape
     scale = np.square(trace) / 2 if d == 2 else np.sum(np.square(tensors), axis=(-2, -1)) / 1.5
     scalars = {"trace": trace, "determinant": np.linalg.det(tensors), "anisotropy": np.sqrt(size / scale)}
     return {name: np.where(field.grid.inside, values, np.nan) for name, values in scalars.items()}
+
+
+def _known_tensors(field: TensorField) -> Float[np.ndarray, "*shape d d"]:
+    require_field(field)
+    require_static("field", field)
+    with jax.ensure_compile_time_eval():  # a function under jax.jit may close over the field
+        return np.asarray(field.domain_tensors, np.float64)
 
 
 def gaussian_scale_space(
@@ -122,21 +129,23 @@ def gaussian_scale_space(
         functions: (*shape), or (…, *shape) for several functions; values outside the mask are not used.
 
     Raises:
-        ValueError: if a time is not positive, or if the functions have another shape.
+        ValueError: if a time is not positive, if the functions have another shape, or if an argument is traced.
 
     Examples:
         >>> blurred = hj.gaussian_scale_space(field, [0.2], np.ones((9, 9)))
         >>> print(blurred.min().round(3), blurred.max().round(3))
         1.0 1.0
     """
-    require_field(field)
-    grid, d = field.grid, field.grid.dimension
+    tensors, grid, d = _known_tensors(field), field.grid, field.grid.dimension
+    for name, value in (("times", times), ("functions", functions)):
+        require_static(name, value)
     require_real("functions", functions)
-    t, u = np.asarray(checked_times(times, float)), np.asarray(functions, np.float64)
+    with jax.ensure_compile_time_eval():
+        t, u = np.asarray(checked_times(times, float)), np.asarray(functions, np.float64)
     if u.shape[u.ndim - d :] != grid.shape:
         raise ValueError(f"functions: got shape {u.shape}; expected {grid.shape}, with optional leading axes")
     inside = grid.inside
-    determinant = np.linalg.det(np.asarray(field.domain_tensors, np.float64)[inside])
+    determinant = np.linalg.det(tensors[inside])
     scale = float(np.mean(determinant ** (1 / d)))
     blurred = [_blur(np.where(inside, u, 0), inside, math.sqrt(2 * one / scale), grid.spacing) for one in t]
     return np.where(inside, np.stack(blurred), np.nan)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.arrays import nan_is_meant
 from hks_jax.checks import require_count, require_number, require_real
 from hks_jax.compilation import library_of, numpy_where_known
@@ -71,6 +72,9 @@ def scale_invariant_hks(
         times: (n,) log-spaced times; give all domains the same times to compare them at absolute scales. The default
             runs from 4 ln10/λ_last to 4 ln10/λ₁.
 
+    Raises:
+        ValueError: if n_frequencies is not from 1 to n/2 + 1, or if concrete times are not log-spaced.
+
     Examples:
         >>> nine = hj.eigenpairs(hj.TensorField(field.grid, 9 * field.tensors), k=12)
         >>> np.allclose(hj.scale_invariant_hks(nine), hj.scale_invariant_hks(pairs), atol=1e-3)
@@ -83,6 +87,7 @@ def scale_invariant_hks(
         times = 4 * math.log(10.0) / jnp.geomspace(last, first, n_times)
     else:
         times = resolved_times(pairs, times)
+        _require_log_spaced(times)
     if not 1 <= n_frequencies <= times.size // 2 + 1:
         raise ValueError(
             f"n_frequencies: got {n_frequencies}; expected 1 to {times.size // 2 + 1} for {times.size} times"
@@ -91,6 +96,19 @@ def scale_invariant_hks(
     # The derivative d/dτ at t = exp τ is t d/dt, which has a closed form.
     slope = spectral_diagonal(pairs, Derivative(Heat(times), Heat(times))) / signature
     return jnp.abs(jnp.fft.rfft(slope, axis=0))[:n_frequencies] / times.size
+
+
+def _require_log_spaced(times: Float[Array, " n"]) -> None:
+    times = jax.lax.stop_gradient(times)
+    if is_traced(times):
+        return
+    steps = np.diff(np.log(np.asarray(times, np.float64)))
+    # The logarithm of a rounded time t (1 + ε) has the error ε.
+    if steps.size and not np.allclose(steps, np.mean(steps), rtol=1e-3, atol=4 * float(jnp.finfo(times.dtype).eps)):
+        raise ValueError(
+            f"times: got steps of log t from {steps.min():.4g} to {steps.max():.4g}; expected equal steps, which the "
+            "Fourier transform along log t needs. Use np.geomspace"
+        )
 
 
 def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Array, "n_energies *shape"]:
@@ -106,6 +124,9 @@ def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Arr
     Raises:
         ValueError: if only one of energies and sigma is given or one is invalid, or if no eigenvalue is positive.
 
+    Warns:
+        AccuracyWarning: if concrete energies are above log λ_last − 2σ, where pairs that were not computed contribute.
+
     Examples:
         >>> lowest = hj.wks(pairs)[0]
         >>> print((pairs.pencil.mass @ lowest.ravel()).sum().round(1))  # a mean of φᵢ²
@@ -113,7 +134,7 @@ def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Arr
     """
     if (energies is None) != (sigma is None):
         raise ValueError("energies, sigma: got only one; expected both, as from `default_energies`, or neither")
-    positive_range(pairs)
+    _, last = jax.lax.stop_gradient(positive_range(pairs))
     if energies is None:
         energies, sigma = default_energies(pairs)
     require_real("energies", energies)
@@ -124,10 +145,25 @@ def wks(pairs: Eigenpairs, energies: Any = None, sigma: Any = None) -> Float[Arr
     if sigma.ndim != 0:
         raise ValueError(f"sigma: got shape {sigma.shape}; expected one positive width in log λ")
     require_number("sigma", sigma)
+    _warn_of_energies(*jax.lax.stop_gradient((energies, sigma, last, pairs.next_eigenvalue)))
     # Dividing the numerator and the denominator by the largest exponential prevents underflow far from all log λᵢ.
     offset = _largest_exponents(*jax.lax.stop_gradient((energies, sigma, pairs.eigenvalues, pairs.kept)))
     bells = Wave(energies, jnp.broadcast_to(sigma, energies.shape), offset)
     return spectral_diagonal(pairs, bells, 1 / spectral_trace(pairs, bells))
+
+
+def _warn_of_energies(energies: Array, sigma: Array, last: Array, following: Array) -> None:
+    if is_traced((energies, sigma, last, following)) or np.isinf(following):
+        return
+    highest = math.log(float(last)) - 2 * float(sigma)
+    # The last of the default energies has this value up to rounding.
+    beyond = np.asarray(energies) > highest + 1e-3 * float(sigma)
+    if beyond.any():
+        warn_of_accuracy(
+            f"energies: {int(beyond.sum())} of {beyond.size} energies, up to {float(np.max(energies)):.4g}, are too "
+            "large for k: eigenpairs that were not computed contribute to them. Use energies of at most "
+            f"{highest:.4g}, which is log λ_last − 2σ, or more eigenpairs"
+        )
 
 
 @numpy_where_known()

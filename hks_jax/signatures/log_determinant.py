@@ -120,11 +120,11 @@ def log_determinant(
         coefficients: at least a₀, …, a_d of the heat trace ~ Σⱼ aⱼ t^((j−d)/2), as from `heat_coefficients` for d = 2.
         extrapolate: the next powers of t in the expansion, with unknown coefficients: (1, 2) on a closed curved
             surface, (0.5, 1) with a curved boundary, none on flat tori and polygons.
-        time: T, in (metric length)²; by default the time with the least estimated error.
+        time: T, a positive number in (metric length)²; by default the time with the least estimated error.
 
     Raises:
-        ValueError: if there are fewer than d + 1 coefficients, if a power is not positive, if an eigenvalue is negative
-            or none is positive, or if the dimension is not known.
+        ValueError: if there are fewer than d + 1 coefficients, if a power or the time is not positive, if an eigenvalue
+            is negative or none is positive, or if the dimension is not known.
 
     Warns:
         AccuracyWarning: if the estimated error exceeds 0.01.
@@ -141,9 +141,15 @@ def log_determinant(
     if a.ndim != 1 or a.size <= d:
         raise ValueError(f"coefficients: got shape {a.shape}; expected at least {d + 1} coefficients, a₀ to a_{d}")
     powers = np.asarray(extrapolate, float)
-    if not (powers > 0).all() or len(set(powers)) != powers.size:
-        raise ValueError(f"extrapolate: got {extrapolate}; expected distinct positive powers of t")
-    if not is_traced(pairs.eigenvalues) and (pairs.eigenvalues < 0).any():
+    if powers.ndim != 1 or not (powers > 0).all() or len(set(powers)) != powers.size:
+        raise ValueError(
+            f"extrapolate: got {extrapolate}; expected a list of distinct positive powers of t, as (0.5, 1)"
+        )
+    if time is not None:
+        require_number("time", time)
+        if jnp.ndim(time):
+            raise ValueError(f"time: got shape {jnp.shape(time)}; expected one time T")
+    if not is_traced(pairs.eigenvalues) and (np.asarray(pairs.eigenvalues) < 0).any():
         raise ValueError(f"pairs: got the eigenvalue {float(pairs.eigenvalues[0]):.4g}; expected none below zero")
     _, last = jax.lax.stop_gradient(positive_range(pairs))
     steps = 2.0 ** (np.arange(_TIMES) / _PER_DOUBLING)

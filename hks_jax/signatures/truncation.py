@@ -20,6 +20,7 @@ from hks_jax.compilation import jit_quickly, library_of, numpy_where_known
 from hks_jax.eigen.eigenpairs import Eigenpairs
 from hks_jax.fem.resolution import Resolution
 from hks_jax.fem.space import mask_for
+from hks_jax.linear.divided_differences import gauss
 from hks_jax.linear.loops import for_each
 from hks_jax.signatures.filters import Derivative, Heat
 from hks_jax.signatures.spectral_functions import spectral_diagonal
@@ -304,6 +305,32 @@ def resolved_times(pairs: Eigenpairs, times: Any, factor: int = 1) -> Float[Arra
     return times
 
 
+# By Weyl's law N(λ) = N(Λ) ((λ − b)/(Λ − b))^a, with the bottom b of the spectrum and a = d/2, which is less than 2.
+# With u = s^(2−a) for s = (Λ − b)/(λ − b), the eigenvalues above Λ contribute
+#
+#     ∫_Λ^∞ λ^(−2) dN = N(Λ) a/(2 − a) ∫_c^1 (Λ − b + b u^(1/(2−a)))^(−2) du,
+#
+# where c is 0 for infinitely many eigenvalues. The n eigenvalues of a grid end at s = (N(Λ)/n)^(1/a).
+def share_of_inverse_squares(pairs: Eigenpairs) -> float:
+    """Return the share of Σ λᵢ^(−2) over all positive eigenvalues that the k pairs lack, by Weyl's law.
+
+    Values must be concrete, and the dimension known.
+    """
+    a = dimension_of(pairs, "an estimate of the truncation") / 2
+    following, bottom = float(pairs.next_eigenvalue), float(pairs.spectral_origin)
+    if math.isinf(following):
+        return 0.0
+    kept = np.asarray(pairs.eigenvalues, np.float64)[np.asarray(pairs.kept)]
+    first = (kept.size / pairs.n_unknowns) ** ((2 - a) / a)
+    nodes, weights = np.array(gauss(_NODES))
+    u = first + (1 - first) * nodes
+    integral = (1 - first) * np.sum(weights / (following - bottom + bottom * u ** (1 / (2 - a))) ** 2)
+    left = kept.size * a / (2 - a) * integral
+    return float(left / (left + np.sum(kept[kept > 0] ** -2.0)))
+
+
+_NODES = 8
+"""The number of quadrature points of `share_of_inverse_squares`."""
 _EXPONENTS = np.geomspace(0.5, 8, 33)
 """Exponents from ½ (a thin strip, whose lowest modes vary along one axis) to 8 (a 3D corner of Dirichlet sides)."""
 _RESOLVING = scipy.special.gammainccinv(_EXPONENTS, TAIL_LIMIT)

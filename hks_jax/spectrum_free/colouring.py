@@ -33,6 +33,8 @@ class Colouring:
         low: the lower bound on the eigenvalues of D⁻¹M, where the diagonal matrix D holds the row sums of M.
         reach: `Bounds.reach` for each axis, times the longest time.
         across: `Bounds.across` for each axis.
+        shape: the numbers of nodes of the grid, for at most as many of which the sources' spacing is chosen.
+        longest: the longest time, up to which the degree suffices on [0, `top`].
         error: for each time, a bound on the signature's error, including rounding errors, relative to the smaller of
             (4πt)^(−d/2) and the largest possible value at a node. For a lumped mass the bound holds unless `top` is too
             small, which has the probability 10⁻⁶. For a consistent mass the bound is proven to first order in the error
@@ -48,6 +50,8 @@ class Colouring:
     low: float
     reach: tuple[float, ...]
     across: tuple[float, ...]
+    shape: tuple[int, ...]
+    longest: float
     error: tuple[float, ...]
 
     def colours(self, space: GridSpace) -> StaticArray:
@@ -186,10 +190,10 @@ def choose(
         if math.prod(apart) <= math.prod(spacing):
             spacing, degree = apart, shortest
     errors = [error_bound(spacing, degree, time, limits, space) for time in times]
-    reach, across, error = (
-        tuple(x.tolist()) for x in (times.max() * limits.reach, limits.across, np.add(errors, others))
-    )
-    return Colouring(spacing, degree, mass_degree, columns, float(limits.top), float(low), reach, across, error)
+    longest = float(times.max())
+    reach, across, error = (tuple(x.tolist()) for x in (longest * limits.reach, limits.across, np.add(errors, others)))
+    top = float(limits.top)
+    return Colouring(spacing, degree, mass_degree, columns, top, float(low), reach, across, shape, longest, error)
 
 
 def _least_spacing(n: int, reach_time: float, allowed: float, low: float, across: float) -> int:

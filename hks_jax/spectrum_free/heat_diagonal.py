@@ -32,6 +32,8 @@ _ROUNDING = 1e-13
 """The error of the rational approximation of the exponential in double precision."""
 _LATE = 0.3
 """The largest product ελt at which selected inversion is used."""
+_ROUNDED = 1.001
+"""The largest ratio of two bounds that are equal up to rounding."""
 
 
 @nan_is_meant
@@ -71,11 +73,12 @@ def hks_spectrum_free(
         ValueError: invalid times, tolerance or method; a tolerance below the rounding error; a time so large that
             colouring takes about as many vectors as there are nodes (``"auto"`` then uses selected inversion if memory
             suffices); ``"auto"`` on a mesh, if selected inversion takes more than 8 GB; colouring under `jax.jit`
-            without a given `Colouring`.
+            without a given `Colouring`; a `Colouring` for a smaller grid.
         TypeError: colouring on a mesh.
 
     Warns:
-        AccuracyWarning: concrete values are NaN, because errors may exceed a few per cent.
+        AccuracyWarning: concrete values are NaN, because errors may exceed a few per cent, or because a given
+            `Colouring` is not for these times or this domain.
 
     Examples:
         >>> np.allclose(hj.hks_spectrum_free(field, [0.5]), hj.hks(pairs, [0.5]), atol=1e-4)
@@ -85,10 +88,19 @@ def hks_spectrum_free(
     times = checked_times(times, pencil.parts[0].stiffness.dtype)
     require_number("tolerance", tolerance, 1)
     settings = choose_method(pencil, times, method, tolerance)
-    scale, given = jnp.exp(-origin * times), isinstance(method, Colouring)
-    values = [_diagonal(part, times, settings, scale, checked=given) for part in pencil.parts]
+    scale = jnp.exp(-origin * times)
+    values = [_diagonal(part, times, settings, scale) for part in pencil.parts]
     # The mean over even and odd parts is the signature: a point source is half the sum of an even and an odd function.
-    return _nan_if_lost(jnp.mean(jnp.stack(values), axis=0), pencil, times, settings, scale)
+    mean = jnp.mean(jnp.stack(values), axis=0)
+    if isinstance(method, Colouring):
+        excess = _excess(method, *jax.lax.stop_gradient((pencil.parts, times)))
+        fits = jnp.all(jnp.stack(excess) <= _ROUNDED)
+        # Multiplication by NaN makes the derivatives NaN as well.
+        mean = mean * nan_outside(jnp.ones_like(mean), fits)
+        if not is_traced(fits) and not fits:
+            _warn_of_misfit(method, times, *map(float, excess))
+            return mean
+    return _nan_if_lost(mean, pencil, times, settings, scale)
 
 
 def colouring(
@@ -180,7 +192,7 @@ def _read_as_unknowns(pencil: AnyPencil) -> AnyPencil:
 
 
 def _diagonal(
-    part: Pencil, times: Float[Array, " m"], settings: Colouring | None, scale: Float[Array, " m"], checked: bool
+    part: Pencil, times: Float[Array, " m"], settings: Colouring | None, scale: Float[Array, " m"]
 ) -> Float[Array, "m *shape"]:
     # Values are scaled before NaN is inserted, because NaN would enter the derivatives of the scales as 0·NaN.
     space = part.space
@@ -188,10 +200,6 @@ def _diagonal(
         diagonals = selected_inversion(part.stiffness, part.mass, times, dissect(part.pattern))
         return space.extend(scale[:, None] * diagonals)
     values = scale.reshape(-1, *[1] * len(space.node_shape)) * _by_colours(settings, part, times)
-    if checked:
-        # Multiplication by NaN makes the derivatives NaN as well.
-        fits = _fits(settings, *jax.lax.stop_gradient((part, times)))
-        values = values * nan_outside(jnp.ones_like(values), fits)
     return nan_outside(jnp.where(space.free, values, 0), space.domain)
 
 
@@ -202,10 +210,37 @@ def _by_colours(settings: Colouring, part: Pencil, times: Float[Array, " m"]) ->
     return coloured_diagonal(settings, settings.colours(part.space), nodal_pencil(part), coefficients)
 
 
-def _fits(settings: Colouring, part: Pencil, times: Float[Array, " m"]) -> Array:
-    low = jnp.asarray(settings.low, times.dtype)
-    actual, rounding = bounds(part, low, settings.mass_degree), 1.001
-    fits = actual.top <= rounding * settings.top
-    fits &= jnp.all(actual.reach * jnp.max(times) <= rounding * jnp.asarray(settings.reach, times.dtype))
-    fits &= jnp.all(actual.across <= rounding * jnp.asarray(settings.across, times.dtype))
-    return fits & (mass_bound(part) * rounding >= low)
+def _excess(
+    settings: Colouring, parts: tuple[Pencil, ...], times: Float[Array, " m"]
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """Return by which factors the times, the bounds that a slack raises, and the coupling by the mass are too large."""
+    low, d = jnp.asarray(settings.low, times.dtype), len(settings.reach)
+    latest = jnp.max(times)
+    growth, couplings = [], []
+    for part in parts:
+        actual = bounds(part, low, settings.mass_degree)
+        growth.append(actual.top / settings.top)
+        growth += [latest * actual.reach[a] / settings.reach[a] for a in range(d)]
+        growth += [actual.across[a] / settings.across[a] for a in range(d) if settings.across[a]]
+        couplings.append(low / mass_bound(part))
+    # The expansion is that of [0, `settings.top`] for any spectrum, so its degree suffices for the planned times only.
+    return latest / settings.longest, jnp.max(jnp.stack(growth)), jnp.max(jnp.stack(couplings))
+
+
+def _warn_of_misfit(settings: Colouring, times: Float[Array, " m"], late: float, growth: float, coupled: float) -> None:
+    if late > _ROUNDED:
+        warn_of_accuracy(
+            f"method: got a Colouring for times up to {settings.longest:.4g}; expected one for times up to "
+            f"{float(jnp.max(times)):.4g}, so the signature is NaN. Make a new one by `colouring` with all times"
+        )
+    elif coupled > _ROUNDED:
+        warn_of_accuracy(
+            "method: got a Colouring for a mass with weaker couplings, such as a lumped one, so the signature is NaN; "
+            "expected one for this mass. Make a new one by `colouring` with this domain and mass"
+        )
+    else:
+        warn_of_accuracy(
+            "method: got a Colouring for a domain on which the largest eigenvalue or the reach of heat is smaller by a "
+            f"factor of {growth:.3g}, so the signature is NaN; expected one for this domain. Make a new one by "
+            f"`colouring` with this domain, or with a slack {1.005 * growth:.3g} times as large"
+        )

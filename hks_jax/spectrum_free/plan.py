@@ -62,6 +62,12 @@ def choose_method(pencil: AnyPencil, times: Float[Array, " m"], method: Method, 
     axes, dimension = len(method.spacing), pencil.space.dimension
     if axes != dimension:
         raise ValueError(f"method: got a Colouring for {axes} axes; expected {dimension}, as for the grid")
+    # On a longer axis, a spacing of n for one source on n nodes makes several sources, without a bound on the distance.
+    if any(n > planned for n, planned in zip(pencil.space.node_shape, method.shape, strict=True)):
+        raise ValueError(
+            f"method: got a Colouring for a grid of the shape {method.shape}; expected one for at least the shape "
+            f"{pencil.space.node_shape} of this grid. Make a new one by `colouring`"
+        )
     return method
 
 

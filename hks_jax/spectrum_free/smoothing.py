@@ -69,7 +69,7 @@ def smooth(
 
     Raises:
         ValueError: if f has another shape or is not finite inside the mask, if the FWHM is below the spacing, or if the
-            domain is traced (the degree of the polynomials depends on it).
+            domain, the FWHM or the diffusivity is traced (the degree of the polynomials depends on them).
 
     Examples:
         >>> spot = np.zeros((9, 9))
@@ -79,11 +79,12 @@ def smooth(
         >>> print(spread[5, 4] > 2 * spread[4, 5])  # more along the first axis
         True
     """
-    if is_traced((domain, fwhm)):
-        raise ValueError(
-            "domain: got traced values (jax.jit, vmap, grad), on which the degree of the polynomials depends; expected "
-            "a concrete domain and FWHM. Otherwise use `heat_flow` with eigenpairs"
-        )
+    for name, value in (("domain", domain), ("fwhm", fwhm), ("diffusivity", diffusivity)):
+        if is_traced(value):
+            raise ValueError(
+                f"{name}: got traced values (jax.jit, vmap, grad), on which the degree of the polynomials depends; "
+                "expected a concrete domain, FWHM and diffusivity. Otherwise use `heat_flow` with eigenpairs"
+            )
     require_number("fwhm", fwhm)
     what, least = _least_width(domain)
     if fwhm < least:

@@ -130,3 +130,22 @@ def test_smoothing_keeps_constants_and_masks():
         hj.gaussian_scale_space(field, [], u)
     with pytest.raises(ValueError, match=r"functions: got shape \(18, 20\)"):
         hj.gaussian_scale_space(field, [1.0], u[0].T)
+
+
+def test_smoothing_and_invariants_name_traced_arguments_and_take_constants(field):
+    u = np.where(field.grid.inside, 1.0, np.nan)
+
+    def moved(tensors):
+        return hj.TensorField(field.grid, tensors)
+
+    for name, call, value in (
+        ("times", lambda t: hj.gaussian_scale_space(field, t, u), jnp.asarray(TIMES)),
+        ("functions", lambda f: hj.gaussian_scale_space(field, TIMES, f), jnp.asarray(u)),
+        ("field", lambda T: hj.gaussian_scale_space(moved(T), TIMES, u), field.tensors),
+        ("field", lambda T: hj.tensor_invariants(moved(T)), field.tensors),
+    ):
+        with unchecked(), pytest.raises(ValueError, match=f"{name}: got a traced value"):
+            jax.jit(call)(value)
+    both = jax.jit(lambda: (hj.gaussian_scale_space(field, TIMES, u), hj.tensor_invariants(field)["trace"]))()
+    np.testing.assert_allclose(both[0], hj.gaussian_scale_space(field, TIMES, u))
+    np.testing.assert_allclose(both[1], hj.tensor_invariants(field)["trace"])

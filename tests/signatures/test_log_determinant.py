@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from annotations import unchecked
 from differences import directional
 from scipy.special import jn_zeros
 
@@ -121,12 +122,27 @@ def test_of_elements_with_the_derivative_by_the_metric():
     np.testing.assert_allclose(slope, directional(lambda s: torus(np.sqrt(s), 1.0), 1.1, 1.0, 1e-3), atol=0.03)
 
 
+def test_pairs_that_a_compiled_function_closes_over():
+    pairs = pairs_with(of_product(*SIDES, 2 * np.arange(-30, 31)), 2.6)
+    known = hj.heat_coefficients(pairs, 0)
+    found = jax.jit(lambda a, t: hj.log_determinant(pairs, a, time=t).value)(known, 0.02)
+    np.testing.assert_allclose(found, hj.log_determinant(pairs, known, time=0.02).value, rtol=1e-12)
+
+
 def test_what_is_refused_and_warned_of():
     pairs = pairs_with(of_product(*SIDES, WHOLE), 2.6)
     with pytest.raises(ValueError, match=r"coefficients: got shape \(2,\); expected at least 3"):
         hj.log_determinant(pairs, [1.0, 0.0])
     with pytest.raises(ValueError, match="extrapolate: got"):
         hj.log_determinant(pairs, [1.0, 0.0, 0.0], extrapolate=(0,))
+    with unchecked(), pytest.raises(ValueError, match=r"extrapolate: got 0.5; expected a list"):
+        hj.log_determinant(pairs, [1.0, 0.0, 0.0], extrapolate=0.5)
+    with pytest.raises(ValueError, match=r"time: got \[0.02, 0.03\]; expected a finite number above 0"):
+        hj.log_determinant(pairs, [1.0, 0.0, 0.0], time=[0.02, 0.03])
+    with pytest.raises(ValueError, match=r"time: got shape \(2,\); expected one time"):
+        jax.jit(lambda t: hj.log_determinant(pairs, [1.0, 0.0, 0.0], time=t).value)(jnp.array([0.02, 0.03]))
+    with pytest.raises(ValueError, match="time: got 0"):
+        hj.log_determinant(pairs, [1.0, 0.0, 0.0], time=0)
     with pytest.raises(ValueError, match="corners: got"):
         hj.heat_coefficients(pairs, 1, corners=[90.0])
     plane = hj.TensorField(hj.Grid((5, 5)), np.tile(np.eye(2), (5, 5, 1, 1)))

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from differences import directional
 from fields import flat, random_spd
 
 import hks_jax as hj
@@ -496,6 +497,23 @@ def test_alignment_of_even_and_odd_modes_and_of_another_subject(rng):
     before = np.asarray(hj.hks(nearly, [0.05], "raw"))
     after = np.asarray(hj.hks(joined.pairs, [0.05], "raw"))
     assert 0 < np.abs(after / before - 1).max() < 0.03
+
+
+@pytest.mark.parametrize("boundary", ["neumann", pytest.param("mirror", marks=pytest.mark.slow)])
+def test_aligned_modes_have_derivatives_by_the_tensors(boundary, rng):
+    """Each problem has simple eigenvalues, so the rotations are signs: the slope is that by differences."""
+    field = flat((7, 6), (1.0, 1.3))
+    reference = hj.eigenpairs(field, 5, boundary, solver="dense")
+    change, weights = random_spd(rng, (7, 6), 0.5), rng.standard_normal((7, 6))
+    nodes = np.array([[0, 0], [2, 3], [5, 1]])
+
+    def value(tensors):
+        pairs = hj.eigenpairs(hj.TensorField(field.grid, tensors), 5, boundary, solver="dense")
+        aligned = hj.align(pairs, reference, (nodes, nodes)).pairs
+        return jnp.sum(weights * (hj.hks(aligned, [0.6])[0] + hj.heat_kernel(aligned, [0.6], (1, 2))[0, 0]))
+
+    slope = jnp.vdot(jax.grad(value)(field.tensors), change)
+    np.testing.assert_allclose(slope, directional(value, field.tensors, change, 1e-3), rtol=1e-6)
 
 
 def test_alignments_that_are_refused(rng):

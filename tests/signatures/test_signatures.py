@@ -12,7 +12,7 @@ from scipy.linalg import expm
 
 import hks_jax as hj
 from hks_jax.signatures import contractions
-from hks_jax.signatures.truncation import beyond, beyond_by_weyl, median_of_shares
+from hks_jax.signatures.truncation import beyond, beyond_by_weyl, median_of_shares, share_of_inverse_squares
 
 
 @pytest.fixture(scope="module")
@@ -98,6 +98,37 @@ def test_wks_is_a_weighted_mean_of_squares(pairs):
     np.testing.assert_allclose(far, functions[0] ** 2, rtol=1e-9)
 
 
+def test_scale_invariance_takes_log_spaced_times(pairs):
+    single = hj.eigenpairs(flat((6, 7), (1.0, 1.1)), 42, solver="dense")
+    single = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, single)
+    for given in (pairs, single):
+        for times in (np.geomspace(2.0, 8.0, 300), np.geomspace(8.0, 2.0, 20), [2.0], [2.0, 3.0]):
+            hj.scale_invariant_hks(given, 1, times=times)
+        with pytest.raises(ValueError, match=r"times: got steps of log t from 0.2877 to 0.6931; expected equal steps"):
+            hj.scale_invariant_hks(given, 2, times=[2.0, 4.0, 6.0, 8.0])
+    found = jax.jit(lambda t: hj.scale_invariant_hks(pairs, 2, times=t))(jnp.array([2.0, 4.0, 6.0]))
+    assert np.isfinite(found[:, pairs.space.domain]).all()
+
+
+def test_wks_tells_of_energies_to_which_pairs_are_missing():
+    pencil = hj.assemble(flat((12, 13), (1.0, 1.1)))
+    few, every = (hj.eigenpairs(pencil, k, solver="dense") for k in (40, 156))
+    last, sigma = float(jnp.log(few.eigenvalues[-1])), 0.3
+    highest = last - 2 * sigma
+    for energy, error in ((last - 0.3, 0.1), (last + 0.5, 0.5)):
+        with pytest.warns(
+            hj.AccuracyWarning, match=f"energies: 1 of 2 .* Use energies of at most {highest:.4g}, .* more"
+        ):
+            found = hj.wks(few, [highest, energy], sigma)
+        exact = hj.wks(every, [highest, energy], sigma)
+        assert jnp.max(jnp.abs(found / exact - 1)[1]) > error
+    # The largest energy without a warning; the default energies, also as arguments; every pair; traced energies.
+    np.testing.assert_allclose(found[0], exact[0], rtol=0.1)
+    hj.wks(few)
+    hj.wks(few, *hj.default_energies(few, 30))
+    jax.jit(lambda e: hj.wks(few, e, sigma))(jnp.array([last]))
+
+
 @pytest.mark.slow
 def test_scale_invariance(field, pairs):
     scaled = hj.eigenpairs(hj.TensorField(field.grid, 9.0 * field.tensors), pairs.k)
@@ -141,6 +172,31 @@ def test_default_times_span_the_spectrum(field):
     assert hj.default_times(pairs, 2, 1 - 1e-9)[1] == pytest.approx(float(times[0]))  # not before the first
     with pytest.raises(ValueError, match="decay: got 1"):
         hj.default_times(pairs, 2, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("shape", "boundary", "potential"),
+    [((12, 13), "neumann", None), ((12, 13), "dirichlet", None), ((7, 6, 7), "mean", None), ((12, 13), "neumann", 5.0)],
+)
+def test_the_biharmonic_distance_tells_what_few_pairs_lack(shape, boundary, potential):
+    """The mean over all sources and nodes of the squared distance, against all eigenpairs."""
+    pencil = hj.assemble(flat(shape, (1.0, 1.1, 0.9)), boundary, potential=potential)
+    every = hj.eigenpairs(pencil, sum(part.space.n_dof for part in pencil.parts), solver="dense")
+    assert share_of_inverse_squares(every) == 0
+    inverse = np.square(1 / np.asarray(every.eigenvalues)[every.n_null :])
+    source = (0,) * len(shape)
+    hj.biharmonic_distance(every, source)
+    for k in (10, 60):
+        few = hj.eigenpairs(pencil, k, solver="dense", multiplet="drop")
+        lacks = inverse[int(few.kept.sum()) - every.n_null :].sum() / inverse.sum()
+        assert 0.6 < share_of_inverse_squares(few) / lacks < 1.5
+        if k == 10 or len(shape) == 3:
+            with pytest.warns(
+                hj.AccuracyWarning, match=r"pairs: got .* squared biharmonic distance .* more eigenpairs"
+            ):
+                hj.biharmonic_distance(few, source)
+        else:
+            hj.biharmonic_distance(few, source)
 
 
 @pytest.mark.slow
@@ -484,7 +540,7 @@ def test_batches_and_other_objects_are_refused(field, pairs):
 def test_everything_runs_under_jit(field):
     @jax.jit
     def everything(field, times):
-        pairs = hj.eigenpairs(field, 12, solver="dense")
+        pairs = hj.eigenpairs(field, 16, solver="dense")
         return (
             hj.hks(pairs, times), hj.wks(pairs), hj.scale_invariant_hks(pairs), hj.heat_trace(pairs, times),
             hj.heat_kernel(pairs, times, (4, 4)), hj.diffusion_distance(pairs, times, (4, 4)),
@@ -493,7 +549,7 @@ def test_everything_runs_under_jit(field):
         )  # fmt: skip
 
     times = jnp.array([1.0, 2.0])
-    pairs = hj.eigenpairs(field, 12, solver="dense")
+    pairs = hj.eigenpairs(field, 16, solver="dense")
     traced = everything(field, times)
     np.testing.assert_allclose(traced[0], hj.hks(pairs, times), rtol=1e-10)
     np.testing.assert_allclose(traced[6], hj.biharmonic_distance(pairs, (4, 4)), rtol=1e-8, atol=1e-7)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from annotations import unchecked
 from fields import random_spd
 
 import hks_jax as hj
@@ -176,3 +177,7 @@ def test_smoothing_that_is_refused():
         hj.smooth(hj.examples.sphere_mesh(2), np.ones(42), 0.1)
     with pytest.raises(ValueError, match="domain: got traced values"):
         jax.jit(lambda T: hj.smooth(hj.TensorField(field.grid, T), f, 6.0))(field.tensors)
+    with unchecked(), pytest.raises(ValueError, match="fwhm: got traced values"):
+        jax.jit(lambda width: hj.smooth(field, f, width))(6.0)
+    with unchecked(), pytest.raises(ValueError, match="diffusivity: got traced values"):
+        jax.jit(lambda D: hj.smooth(field, f, 6.0, diffusivity=D))(1.0)

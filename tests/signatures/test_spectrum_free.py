@@ -244,6 +244,62 @@ def test_traced_values_need_settings_and_settings_must_fit():
         jax.grad(jax.grad(lambda s: loss(s, method=settings)))(1.0)
 
 
+def constant(n, c=1.0):
+    """The metric c·I on n × n nodes at distances √c."""
+    return hj.TensorField(hj.Grid((n, n)), np.broadcast_to(c * np.eye(2), (n, n, 2, 2)))
+
+
+def test_a_colouring_serves_no_times_beyond_those_planned():
+    """Four times the metric and the time: heat reaches as many nodes as planned, but the degree is too small."""
+    settings = hj.colouring(constant(24), [4.0], mass="lumped")
+
+    @jax.jit
+    def signature(c, times):
+        domain = hj.TensorField(hj.Grid((24, 24)), c * constant(24).tensors)
+        return hj.hks_spectrum_free(domain, times, mass="lumped", method=settings)
+
+    exact = hj.hks_spectrum_free(constant(24, 4.0), [4.0], mass="lumped", method="selected-inversion")
+    np.testing.assert_allclose(signature(4.0, jnp.array([4.0])), exact, atol=1e-4 / (16 * np.pi))
+    assert np.isnan(signature(4.0, jnp.array([16.0]))).all()
+    with pytest.warns(hj.AccuracyWarning, match=r"method: got a Colouring for times up to 4; .* up to 16, .*all times"):
+        found = hj.hks_spectrum_free(constant(24, 4.0), [16.0], mass="lumped", method=settings)
+    assert np.isnan(found).all()
+
+
+def test_a_colouring_serves_no_larger_grid():
+    """One source on 8 nodes has no other source of its colour; on 16 nodes it has one at the distance 8."""
+    settings = hj.colouring(constant(8), [20.0], mass="lumped", slack=1.5)
+    call = partial(hj.hks_spectrum_free, mass="lumped", method=settings)
+    message = r"method: got a Colouring for a grid of the shape \(8, 8\); expected .* the shape \(16, 16\)"
+    with pytest.raises(ValueError, match=message):
+        call(constant(16), [20.0])
+    with pytest.raises(ValueError, match=message):
+        jax.jit(lambda t: call(constant(16), t))(jnp.array([20.0]))
+    exact = hj.hks_spectrum_free(constant(7), [20.0], mass="lumped", method="selected-inversion")
+    np.testing.assert_allclose(call(constant(7), [20.0]), exact, atol=1e-4 / (80 * np.pi))
+
+
+@pytest.mark.parametrize("boundary", ["neumann", "dirichlet"])
+def test_a_colouring_for_another_metric_or_mass_is_told_with_the_remedy(boundary):
+    """On half the metric the spectrum is twice as large. Dirichlet conditions once gave another cause."""
+    settings = hj.colouring(constant(12), [2.0], boundary, mass="lumped")
+    with pytest.warns(hj.AccuracyWarning) as told:
+        found = hj.hks_spectrum_free(constant(12, 0.5), [2.0], boundary, mass="lumped", method=settings)
+    assert np.isnan(found).all()
+    (message,) = [str(each.message) for each in told]
+    assert message.startswith("method: got a Colouring for a domain on which the largest eigenvalue")
+    slack = float(message.split("with a slack ")[1].split(" times")[0])
+    assert 2 <= slack < 2.05
+    wider = hj.colouring(constant(12), [2.0], boundary, mass="lumped", slack=slack)
+    if boundary == "neumann":
+        exact = hj.hks_spectrum_free(constant(12, 0.5), [2.0], mass="lumped", method="selected-inversion")
+        found = hj.hks_spectrum_free(constant(12, 0.5), [2.0], mass="lumped", method=wider)
+        np.testing.assert_allclose(found, exact, atol=1e-4 / (8 * np.pi))
+    else:
+        with pytest.warns(hj.AccuracyWarning, match="a mass with weaker couplings"):
+            hj.hks_spectrum_free(constant(12), [1.0], boundary, method=settings)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["selected-inversion", "colouring"])
 def test_amplified_errors_give_nan(method):
@@ -318,7 +374,8 @@ def test_coefficients_and_poles():
 
 def test_sources_of_a_colour_are_apart_also_around_a_periodic_axis():
     space = GridSpace(hj.Grid((23, 17)), normalise_boundary(("periodic", "neumann"), 2))
-    colours = hj.Colouring((5, 4), 1, 1, 1, 1.0, 1.0, (1.0, 1.0), (0.0, 0.0), (0.0,)).colours(space).value
+    settings = hj.Colouring((5, 4), 1, 1, 1, 1.0, 1.0, (1.0, 1.0), (0.0, 0.0), (23, 17), 1.0, (0.0,))
+    colours = settings.colours(space).value
     assert set(np.unique(colours)) == set(range(colours.max() + 1))
     for colour in range(colours.max() + 1):
         i, j = np.nonzero(colours == colour)
