@@ -226,7 +226,7 @@ def _panels(result: Result, args: argparse.Namespace) -> Any:
 
 def _curves(result: Result, args: argparse.Namespace) -> Any:
     from hks_jax.plot import hks_curves, new_figure
-    from hks_jax.plot.signature import placed
+    from hks_jax.plot.signature import placed, quantity
 
     refuse(args, ("slice", "through", "quantiles"), "--points draws curves; leave this option out")
     grid, d, flat = result.grid, result.dimension, result.normalisation == "flat"
@@ -243,7 +243,9 @@ def _curves(result: Result, args: argparse.Namespace) -> Any:
     if result.smallest_time:
         style["limit"] = result.smallest_time
     figure = new_figure(5.4, 4.0)
-    hks_curves(figure.subplots(), values, result.times, grid, args.points, **style)
+    axes = figure.subplots()
+    hks_curves(axes, values, result.times, grid, args.points, **style)
+    axes.set_ylabel(quantity(result))
     if args.title:
         figure.suptitle(args.title)
     return figure

@@ -87,11 +87,10 @@ def eigenpairs(
     pencil = pencil_of(domain, boundary, mass, quadrature)
     total = sum(part.size for part in pencil.parts)
     number = np.asarray(k)
-    if number.ndim or number.dtype.kind not in "iuf" or number != number // 1 or not 1 <= number <= total:
-        raise ValueError(
-            f"k: got {k}; expected an integer from 1 to {total}, the number of degrees of freedom. "
-            "Use a smaller k or a finer grid"
-        )
+    real = number.ndim == 0 and number.dtype.kind in "iuf"
+    if not real or number != number // 1 or not 1 <= number <= total:
+        remedy = ". Use a smaller k or a finer grid" * bool(real and number > total)
+        raise ValueError(f"k: got {k}; expected an integer from 1 to {total}, the number of degrees of freedom{remedy}")
     k = int(number)
     size = min(k + SPARE, total) if multiplet == "complete" else k
     pairs = pairs_of_pencils(pencil, solver, size, throw, progress or silent, start).truncated(k, multiplet)

@@ -24,6 +24,8 @@ _ROUNDED = 1e-3
 """If rounding tensors to float32 changes eigenvalues by more than this relative error, a message reports it."""
 UNCERTAIN = 1e-2
 """If rounding matrices to float32 changes eigenvalues by more than this relative error, a message reports it."""
+_ZERO = 1e-9
+"""The size of an eigenvalue, relative to the last one, up to which it is zero within rounding."""
 _SAMPLE = 20_000
 """The number of tensors in the sample that measures anisotropy."""
 
@@ -239,7 +241,14 @@ class Eigenpairs(ABC):
         kept, (_, cut_multiplet, unconfirmed) = int(np.asarray(self.kept).sum()), self._cut
         cut = int(cut_multiplet)
         sentences, last = [], values[kept - 1]
-        if bad.any():
+        lost = bad & (np.arange(values.size) >= self.n_null) & (np.abs(values) <= _ZERO * abs(last))
+        given = isinstance(self.space, MatrixSpace)
+        if given and self.null_space_known and lost.any():
+            sentences.append(
+                f"K has {int(lost.sum())} null vectors beyond the {self.n_null} given: expected a basis of its whole "
+                "null space as null_vectors. Add them, or give none"
+            )
+        elif bad.any():
             missing, worst = int(np.isnan(values).sum()), np.nanmax(np.asarray(self.residuals)[bad], initial=0.0)
             found = f"; the largest relative residual of the others is {worst:.1e}" if missing < bad.sum() else ""
             better = "" if values.dtype == np.float64 else "float64, "
@@ -263,8 +272,7 @@ class Eigenpairs(ABC):
         if (uncertain := np.asarray(self.uncertain)).any():
             some = ", ".join(f"{value:.3g}" for value in values[uncertain][:3])
             most, of = float(np.asarray(self.rounding)[uncertain].max()), int(uncertain.sum())
-            own = isinstance(self.space, MatrixSpace) and not self.null_space_known
-            stated = ", or give `sparse_pencil` the null vectors" if own else ""
+            stated = ", or give `sparse_pencil` the null vectors" * (given and not self.null_space_known)
             single = values.dtype == np.float32
             remedy = "Use float64" if single else "Eliminate unknowns instead of fixing them by large entries"
             sentences.append(

@@ -87,7 +87,7 @@ def sparse_pencil(
     if dimension not in (None, 2, 3):
         raise ValueError(f"dimension: got {dimension!r}; expected 2 or 3, or None if there is no manifold")
     if shape is not None:
-        shape = (shape,) if isinstance(shape, int) else tuple(shape)
+        shape = (int(shape),) if isinstance(shape, numbers.Integral) else tuple(shape)
         if math.prod(shape) != n or min(shape) < 1:
             raise ValueError(f"shape: got {shape}, {math.prod(shape)} nodes; expected {n} nodes")
     if volume is not None:

@@ -131,8 +131,9 @@ def quantity(result: Result) -> str:
     factor, _ = POWERS[result.dimension]
     root = r"\sqrt{|D|}\," if result.settings.get("operator") == "fick" else ""
     names = {"heat-trace": "HKS / heat trace", "volume": "HKS · volume", "flat": f"${factor}{root}$·HKS"}
-    power = {2: "", 3: "$^{3/2}$"}[result.dimension]
-    return names.get(result.normalisation, f"HKS in 1/{result.unit}{power}" if result.unit == "s" else "HKS")
+    base, _, power = result.unit_of_values.partition("^-")
+    power = {"1": "", "1.5": "$^{3/2}$"}.get(power, f"$^{power}$")
+    return names.get(result.normalisation, f"HKS in 1/{base}{power}" if base else "HKS")
 
 
 def range_notes(result: Result, values: Real[np.ndarray, "n_times *shape"], colours: Sequence[Colours]) -> list[str]:
@@ -149,7 +150,9 @@ def range_notes(result: Result, values: Real[np.ndarray, "n_times *shape"], colo
 
 def caption(result: Result) -> str:
     """Return the title of a signature's figure: the normalisation, the unit, and the metric."""
-    factor, unit = POWERS[result.dimension]
+    (factor, unit), fick = POWERS[result.dimension], result.settings.get("operator") == "fick"
+    if fick:  # whose eigenfunctions are normalised in the volume of space
+        unit = rf"\mathrm{{length}}^{{-{result.dimension}}}"
     names = {
         "raw": f"HKS in units of ${unit}$",
         "heat-trace": f"HKS / heat trace in units of ${unit}$",
@@ -157,7 +160,7 @@ def caption(result: Result) -> str:
         "flat": f"${factor}$·HKS, which is 1 for flat space",
     }
     metric = METRICS.get(result.settings.get("metric") or "")
-    if result.settings.get("operator") == "fick":
+    if fick:
         names["flat"] = rf"${factor}\sqrt{{|D|}}\,$HKS, which is 1 for constant D"
         return f"{names[result.normalisation]}, Fick's operator"
     return names[result.normalisation] + f", metric {metric}" * (metric is not None)
@@ -222,7 +225,8 @@ def middle_slice(
     """
     if volume.dimension == 2:
         return volume, lambda values: values
-    index = int(np.median(np.flatnonzero(inside.any(axis=(0, 1)))))
+    planes = np.flatnonzero(inside.any(axis=(0, 1)))
+    index = int(planes[(len(planes) - 1) // 2])  # of the domain, even if it has a gap
     return volume.slice("z", index), lambda values: values[..., index]
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.arrays import nan_is_meant, nan_outside
 from hks_jax.eigen.eigenpairs import Eigenpairs, require_pairs
-from hks_jax.fem.space import FunctionSpace
+from hks_jax.fem.space import FunctionSpace, VectorSpace
 from hks_jax.signatures.filters import Filter, Heat, Power
 from hks_jax.signatures.spectral_functions import (
     source_indices,
@@ -69,6 +69,8 @@ def biharmonic_distance(pairs: Eigenpairs, sources: Any) -> Float[Array, "n_sour
     require_pairs(pairs)
     known = pairs.null_space_known or not is_traced(jax.lax.stop_gradient(pairs.eigenvalues))
     count = pairs.n_null if known else 0
+    if isinstance(pairs.space, VectorSpace):
+        raise ValueError("pairs: got eigenpairs of vector-valued functions; the biharmonic distance needs scalar ones")
     if count and (components := max(count, pairs.space.n_components)) > 1:  # some may have Dirichlet nodes
         raise ValueError(
             f"pairs: got eigenpairs of {components} components, between which the biharmonic distance is infinite; "

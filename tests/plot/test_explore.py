@@ -150,14 +150,14 @@ def test_all_arrays_at_nodes_are_turned_with_the_volume(tmp_path):
         settings = {"operator": "fick", "metric": "inverse", "normalisation": "raw"}
         result = Result(place, values[:, ::step], TIMES, arrays=turned, report={"settings": settings})
         pages.append(explore(result, tmp_path / "page.html").read_text(encoding="utf-8"))
-    for name, dtype in {"values": "<f4", "deviation": "<f4", "z": "<f4", "near": np.uint8}.items():
+    for name, dtype in {"values": "<f4", "deviation": "<f4", "z": "<f4", "density": "<f4", "near": np.uint8}.items():
         ours, theirs = (block(page, name, dtype) for page in pages)
         assert len(set(ours)) > 1
         np.testing.assert_array_equal(ours, theirs)
-    flat = block(pages[0], "values", "<f4").reshape(TIMES.size, -1) / values.reshape(TIMES.size, -1)
-    np.testing.assert_allclose(
-        flat / flat[:, :1], (density / density[0, 0, 0]).ravel()[None].repeat(7, 0), rtol=2 * EXACT
-    )
+    # The means and distances of the page are those of the HKS, which the page multiplies by √|D| for one quantity.
+    plain = block(pages[0], "values", "<f4").reshape(TIMES.size, -1) / values.reshape(TIMES.size, -1)
+    np.testing.assert_allclose(plain, (4 * np.pi * TIMES[:, None]) ** 1.5 + 0 * plain, rtol=2 * EXACT)
+    np.testing.assert_allclose(block(pages[0], "density", "<f4"), density.ravel(), rtol=2 * EXACT)
 
 
 def test_every_script_beside_the_code_is_used():

@@ -29,7 +29,7 @@ from hks_jax.plot import (
 )
 from hks_jax.plot.glyphs import FILL
 from hks_jax.plot.modes import modes_panels
-from hks_jax.plot.signature import away_from_rim
+from hks_jax.plot.signature import away_from_rim, caption, middle_slice, quantity
 
 
 def rotating_field(index, n=81, centre=(0.0, 0.0), mask=None):
@@ -485,6 +485,28 @@ def test_pictures_are_cropped_and_coloured_away_from_the_rim():
     deep = away_from_rim(solid)
     assert deep.sum() > solid.sum() / 3
     assert not deep[..., 1].any()
+
+
+def test_labels_of_ficks_signature_have_its_factor_and_its_unit():
+    place = TensorVolume(np.broadcast_to(np.eye(2), (6, 5, 2, 2)), (1.0, 1.0), (0.0, 0.0), length_unit="mm")
+
+    def labels(normalisation):
+        report = {"settings": {"operator": "fick", "normalisation": normalisation}}
+        result = Result(place, np.ones((1, 6, 5)), np.array([2.0]), report=report)
+        return quantity(result), caption(result)
+
+    assert labels("raw") == ("HKS in 1/mm$^2$", r"HKS in units of $\mathrm{length}^{-2}$, Fick's operator")
+    assert labels("flat")[0] == r"$4\pi t\sqrt{|D|}\,$·HKS"
+
+
+def test_the_middle_slice_of_a_domain_with_a_gap_is_one_of_its_slices():
+    inside = np.zeros((4, 4, 8), bool)
+    inside[..., [0, 1, 6, 7]] = True
+    volume = TensorVolume(np.broadcast_to(np.eye(3), (4, 4, 8, 3, 3)), (1.0,) * 3, (0.0,) * 3, mask=inside)
+    plane, cut = middle_slice(volume, inside)
+    assert plane.mask is not None
+    assert plane.mask.all()
+    assert cut(inside).all()
 
 
 @pytest.mark.parametrize(

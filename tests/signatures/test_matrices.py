@@ -243,6 +243,13 @@ def test_what_sparse_pencil_refuses():
         hj.sparse_pencil(K, M, dimension=4)
 
 
+def test_null_vectors_that_are_not_all_are_told():
+    path = sp.diags([-np.ones(5), np.r_[1, 2 * np.ones(4), 1], -np.ones(5)], [-1, 0, 1])
+    pencil = hj.sparse_pencil(sp.block_diag([path] * 3), null_vectors=np.ones((1, 18)))
+    with pytest.warns(hj.AccuracyWarning, match="K has 2 null vectors beyond the 1 given: expected a basis"):
+        hj.eigenpairs(pencil, 6, solver="dense")
+
+
 def test_callers_matrices_stay_as_they_are():
     twice = sp.coo_matrix(([1.0, 1.0, 3.0], ([0, 0, 1], [0, 0, 1])), shape=(2, 2))
     hj.eigsh(twice, k=1)

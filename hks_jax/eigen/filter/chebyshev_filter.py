@@ -87,7 +87,7 @@ class ChebyshevFilter(Eigensolver[Pencil]):
     def require(self, pencil: Pencil) -> None:
         """Raise ValueError unless the pencil is that of a grid, with a known lower bound of the spectrum."""
         if not isinstance(pencil.stiffness, StencilOperator):
-            raise ValueError("solver: got 'chebyshev-filter', which needs a grid; use 'shift-invert' for a mesh")
+            raise ValueError("solver: got 'chebyshev-filter', which needs a grid; pass 'shift-invert' for others")
         if not pencil.bounded:
             raise ValueError(
                 "solver: got 'chebyshev-filter', which needs a positive semidefinite stiffness with a known null "

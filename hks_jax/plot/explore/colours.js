@@ -39,7 +39,7 @@ const raised = (text) => [...text].map((c) => "⁰¹²³⁴⁵⁶⁷⁸⁹"[c] ?
 function number(x, largest = Math.abs(x)) {
   if (!Number.isFinite(x)) return "–";
   if (x === 0 || Math.abs(x) < 1e-6 * largest) return "0";
-  const exponent = Math.floor(Math.log10(largest) + 1e-9);
+  const exponent = Math.floor(Math.log10(largest) + 2e-4); // 9.996 is shown as 10
   if (exponent >= 4 || exponent < -3) {
     const digits = (x / 10 ** exponent).toFixed(2).replace(/\.?0+$/, "");
     const tens = `10${raised(String(exponent))}`;

@@ -32,6 +32,7 @@ const dimension = about.dimension;
 const times = about.times;
 const inside = await bytes("inside");
 const values = await floats("values"); // for each time, at the inside nodes in the order of the grid
+const density = about.density ? await floats("density") : null; // √|D| of Fick's operator
 const deviations = about.noise ? await floats("deviation") : null; // the standard deviations of the values due to noise
 const scores = about.fades ? await floats("z") : null; // distances from the values of constant tensors, as normal numbers
 const near = about.rim === null ? null : await bytes("near"); // whether the boundary contributes over a tenth
@@ -85,24 +86,25 @@ const mean = times.map((_, t) => {
   return sum / count;
 });
 
-// A quantity is the stored signature times a factor at each time.
+// A quantity is the stored signature times a factor at each time and, for one quantity, a weight at each node.
 const ones = times.map(() => 1);
 const power = (dimension === 2 ? "4πt" : "(4πt)³⁄²") + (about.fick ? "√|D|" : "");
 const relative = { name: "HKS / mean", long: "HKS divided by its mean at each t", factor: mean.map((m) => 1 / m), centre: 1 };
 const isFlat = about.normalisation === "raw" || about.normalisation === "flat";
 const quantities = isFlat
   ? [
-      { name: `${power}·HKS`, long: `${power}·HKS, 1 where ${about.fick ? "D is constant" : "flat"}`, factor: ones, centre: 1 },
+      { name: `${power}·HKS`, long: `${power}·HKS, 1 where ${about.fick ? "D is constant" : "flat"}`, factor: ones, weights: density, centre: 1 },
       relative,
-      // With Fick's operator the factor √|D| differs between nodes.
-      ...(about.fick ? [] : [{ name: "HKS", long: "HKS", factor: about.flat.map((f) => 1 / f), centre: null, log: true }]),
+      { name: "HKS", long: "HKS", factor: about.flat.map((f) => 1 / f), centre: null, log: true },
     ]
   : [
       { name: `HKS, ${about.normalisation}`, long: `HKS, normalised by ${about.normalisation}`, factor: ones, centre: null },
       relative,
     ];
 
-const curve = (node, quantity, of = values) => times.map((_, t) => of[t * count + node] * quantity.factor[t]);
+const valueOf = (quantity, t, node, of = values) => of[t * count + node] * quantity.factor[t] * (quantity.weights?.[node] ?? 1);
+
+const curve = (node, quantity, of = values) => times.map((_, t) => valueOf(quantity, t, node, of));
 
 // Weights of the trapezoidal rule over log t between two times, normalised to the sum 1.
 function weights(from, to) {
@@ -128,21 +130,26 @@ function distances(node, from, to) {
   return found.map(Math.sqrt);
 }
 
+// The means of a quantity over all nodes.
+const meansOf = (quantity) => (quantity.means ??= quantity.weights
+  ? statistics([...Array(count).keys()], quantity).map((s) => s.mean)
+  : mean.map((m, t) => m * quantity.factor[t]));
+
 // The mean and the standard deviation over some nodes at each time.
 function statistics(nodes, quantity) {
   return times.map((_, t) => {
     let sum = 0;
-    for (const n of nodes) sum += values[t * count + n];
+    for (const n of nodes) sum += valueOf(quantity, t, n);
     const average = sum / nodes.length;
     let squares = 0;
-    for (const n of nodes) squares += (values[t * count + n] - average) ** 2;
-    return { mean: average * quantity.factor[t], deviation: Math.sqrt(squares / nodes.length) * quantity.factor[t] };
+    for (const n of nodes) squares += (valueOf(quantity, t, n) - average) ** 2;
+    return { mean: average, deviation: Math.sqrt(squares / nodes.length) };
   });
 }
 
 // The three quartiles over some nodes at each time.
 function quartiles(nodes, quantity) {
-  const sorted = times.map((_, t) => Float64Array.from(nodes, (n) => values[t * count + n] * quantity.factor[t]).sort());
+  const sorted = times.map((_, t) => Float64Array.from(nodes, (n) => valueOf(quantity, t, n)).sort());
   return [0.25, 0.5, 0.75].map((q) => sorted.map((sample) => sample[Math.round(q * (nodes.length - 1))]));
 }
 

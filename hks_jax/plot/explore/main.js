@@ -19,7 +19,7 @@ function spreadAt(t) {
   return (spreads.get(quantity)[t] ??= quantiles(
     count,
     (n) => {
-      const v = values[t * count + n] * quantity.factor[t];
+      const v = valueOf(quantity, t, n);
       return quantity.centre === null ? v : Math.abs(v - quantity.centre);
     },
     quantity.centre === null ? [0.02, 0.98] : [0.9, 0.9],
@@ -64,7 +64,7 @@ function faded(colour) {
 // Whether the boundary contributes over a tenth at a node and a time, if hatching is on.
 const hatchedAt = (t) => (near && element("rim").checked ? (node) => near[t * count + node] === 1 : null);
 
-const signatureAt = (node) => values[state.time * count + node] * state.quantity.factor[state.time];
+const signatureAt = (node) => valueOf(state.quantity, state.time, node);
 
 function signatureText(node) {
   const text = number(signatureAt(node));
@@ -172,7 +172,7 @@ const band = (line, spread) => ({ low: line.map((m, t) => m - spread[t]), high: 
 
 function seriesShown() {
   const { quantity, points, region } = state;
-  const all = mean.map((m, t) => m * quantity.factor[t]);
+  const all = meansOf(quantity);
   const shown = [{ name: "mean", note: "all points", colour: "--mean", line: all, thin: true }];
   if (region.nodes) {
     if (region.quantity !== quantity) Object.assign(region, { quantity, found: statistics(region.nodes, quantity) });
@@ -287,7 +287,7 @@ function render() {
 state.points.A = surface ? [frontVertex(), 0, 0] : [...about.start, 0].slice(0, 3);
 state.index = [...state.points.A];
 // If most of the domain is far above 1, as in small volumes, all of it would have one colour.
-const typical = () => quantiles(count, (n) => values[state.time * count + n], [0.5])[0];
+const typical = () => quantiles(count, (n) => valueOf(quantities[0], state.time, n), [0.5])[0];
 if (isFlat && typical() > 2) state.quantity = relative;
 setUp();
 measure();

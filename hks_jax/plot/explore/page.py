@@ -137,8 +137,12 @@ def explore(
             f"values: {t.size} times at {int(inside.sum())} nodes take {size / 1024**2:.0f} MiB; expected at most "
             f"{LIMIT // 1024**2} MiB, which a browser can open. Show fewer times, one slice, or part of the domain"
         )
-    # (4πt)^(d/2)·HKS is of order 1 in any unit, so float32 does not underflow.
-    scale = result.to_flat if result.normalisation == "raw" else 1.0
+    # (4πt)^(d/2)·HKS is of order 1 in any unit, so float32 does not underflow. With Fick's operator, the page has √|D|
+    # beside it, because the mean and distances are those of the HKS.
+    fick, is_flat = result.settings.get("operator") == "fick", result.normalisation in ("raw", "flat")
+    scale: Any = 1.0
+    if is_flat:
+        scale = result.flat_scale / (1.0 if result.normalisation == "raw" else result.to_flat)
     shown = {"values": (scale * result.values)[:, inside]}
     if noise is not None:
         shown["deviation"] = (scale * noise)[:, inside]
@@ -153,6 +157,8 @@ def explore(
     if grey is not None:
         numbers["anatomy"] = _packed(grey[box], "u1")
     numbers |= {name: _packed(array, "u1") if name == "near" else _floats(array) for name, array in shown.items()}
+    if fick and is_flat:
+        numbers["density"] = _floats((result.to_flat / result.flat_scale)[0][inside])
     numbers |= {f"layer-{i}": _floats(array) for i, array in enumerate(layers.values())}
     names: dict[int, str] = {}
     if labels is not None:
@@ -174,7 +180,8 @@ def explore(
         "times": t.tolist(),
         "lengths": None if result.lengths is None else result.lengths.tolist(),
         "flat": result.flat_scale.ravel().tolist(),
-        "fick": result.settings.get("operator") == "fick",
+        "fick": fick,
+        "density": "density" in numbers,
         "normalisation": result.normalisation,
         "noise": noise is not None,
         "fades": result.z is not None,
