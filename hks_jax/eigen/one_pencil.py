@@ -22,7 +22,7 @@ from hks_jax.eigen.quality import (
     rounding_of_quotients,
 )
 from hks_jax.eigen.solver import Dense, Eigensolver, Report
-from hks_jax.fem.box import cropped, in_box
+from hks_jax.fem.box import Box, in_box
 from hks_jax.fem.pencil import Pencil
 from hks_jax.fem.space import MatrixSpace
 from hks_jax.linear.host_matrices import balanced, near_zero
@@ -43,14 +43,11 @@ def pairs_of_pencil(
     """Return the k lowest pairs, from those of a similar pencil (``start``). See `solved` for ``throw``."""
     extra = min(1, pencil.size - k)  # the next eigenvalue shows whether k cuts a multiple eigenvalue
     solver = _able(solver, pencil, k, extra)
-    inner = boxed = pencil
-    if not isinstance(solver, Dense):
-        inner = cropped(pencil)  # with the same unknowns
-        boxed = in_box(inner, k + extra)
-    rows = None
+    box = Box(pencil, pencil.space) if isinstance(solver, Dense) else in_box(pencil, k + extra)
+    boxed, rows = box.pencil, None
     if start is not None and start.spare is not None:
         rows = start.space.transfer(jnp.concatenate([start.frame, start.spare]), pencil.space)
-        rows = inner.space.transfer(rows, boxed.space)
+        rows = box.into(rows)
     # NumPy computes in float64, and finds null vectors and eigenvalues near zero that rounding to float32 hides.
     on_host = is_concrete_on_cpu(jax.lax.stop_gradient((boxed, rows)))
     boxed = _with_balance(boxed) if on_host and boxed.stiffness.dtype == np.float32 else boxed
@@ -63,10 +60,10 @@ def pairs_of_pencil(
         kept=jax_array(np.ones(k, bool)),
         next_eigenvalue=following,
         complete_below=bound,
-        frame=boxed.space.transfer(frame, inner.space),
+        frame=box.out_of(frame),
         pencil=pencil,
         solver_name=solver.name,
-        spare=None if spare is None else boxed.space.transfer(spare, inner.space),
+        spare=None if spare is None else box.out_of(spare),
         **quality,
     )
 

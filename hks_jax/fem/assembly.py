@@ -4,17 +4,20 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Literal, get_args
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from hks_jax.arrays import describe_array
-from hks_jax.checks import require_count
+from hks_jax.checks import real_array, require_count
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.fem.boundary import BoundarySpec
 from hks_jax.fem.elements import Quadrature
 from hks_jax.fem.fields import checked_field
 from hks_jax.fem.forms import Form, WeakForm, l2, laplace_beltrami
-from hks_jax.fem.integrals import assemble_grid, assemble_mesh, grid_points, mesh_nodes, mesh_points
+from hks_jax.fem.integrals import assemble_grid, assemble_mesh, grid_points, mesh_points
 from hks_jax.fem.pencil import AnyPencil, MirrorPencil, Pencil
 from hks_jax.fem.problems import problems_of
 from hks_jax.linear.operators import PatternedOperator, require_symmetric
@@ -186,7 +189,7 @@ def _assembled(
     operator = operator._replace(fick=getattr(domain, "operator", None) == "fick")
     points: Callable[..., Any]
     if isinstance(domain, SimplicialMesh):
-        nodes = mesh_nodes(domain, degree, midpoints)
+        nodes = _mesh_nodes(domain, degree, midpoints)
         if degree == 2 and operator.lumped:
             raise ValueError(
                 'mass: got "lumped" with degree=2, where row sums at the vertices are not positive. Use "consistent"'
@@ -226,3 +229,30 @@ def _assembled(
             if isinstance(matrix, PatternedOperator):
                 require_symmetric(name, *matrix.triplets(), matrix.size, "Make the form symmetric in u and v")
     return pencils[0] if len(pencils) == 1 else MirrorPencil(tuple(pencils))
+
+
+def _mesh_nodes(mesh: SimplicialMesh, degree: int, midpoints: Any) -> Float[Array, "nodes 3"]:
+    """Return the positions of the nodes: the vertices and, for degree 2, the midpoints of the edges."""
+    if degree not in (1, 2):
+        raise ValueError(f"degree: got {degree!r}; expected 1 or 2")
+    vertices = mesh.vertices
+    if degree == 1:
+        if midpoints is not None:
+            raise ValueError("midpoints: got positions with degree=1, whose edges are straight; pass degree=2")
+        return vertices
+    middles = jnp.mean(vertices[mesh.triangulation.edges], axis=1)
+    if midpoints is None:
+        return jnp.concatenate([vertices, middles])
+    if mesh._metric is not None:
+        raise ValueError("midpoints: got positions for a mesh with a given metric; leave out midpoints or metric")
+    moved = midpoints
+    if callable(midpoints):
+        on_surface = mesh.triangulation.boundary_edges | (mesh.triangulation.dimension == 2)
+        moved = middles.at[on_surface].set(jax.vmap(midpoints)(middles[on_surface]))
+    moved = real_array("midpoints", moved)
+    if moved.shape != middles.shape:
+        raise ValueError(
+            f"midpoints: got shape {moved.shape}; expected {middles.shape}, one position for each edge of "
+            "mesh.triangulation.edges, or a function that maps an edge's midpoint (3,) to its new position"
+        )
+    return jnp.concatenate([vertices, moved.astype(vertices.dtype)])

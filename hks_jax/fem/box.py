@@ -1,7 +1,7 @@
 """The pencil of a grid on the box around its domain, where similar masks share compiled code."""
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,16 +9,42 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hks_jax.fem.pencil import Pencil
-from hks_jax.fem.space import GridSpace
+from hks_jax.fem.space import FunctionSpace, GridSpace
 from hks_jax.fem.stencil import StencilOperator, coefficients_of
 from hks_jax.linear.operators import DiagonalOperator, Operator
 from hks_jax.linear.symmetric_pencil import NullSpace
 from hks_jax.traced import is_traced
 
 _FILLED = {2: 0.45, 3: 0.6}
-"""The least fraction of free nodes, for each dimension, at which `in_box` uses all nodes. With half of the nodes free
-in 2D, computations on all nodes take 1.4 to 1.9 times as long as on the free nodes, so that ten calls lose the time
-that the shared compilation saves. In 3D the cost of a factorisation grows faster with the number of nodes."""
+"""The least fraction of free nodes, for each dimension, at which all nodes of the box are unknowns. With half of the
+nodes free in 2D, computations on all nodes take 1.4 to 1.9 times as long as on the free nodes, so that ten calls lose
+the time that the shared compilation saves. In 3D the cost of a factorisation grows faster with the number of nodes."""
+
+
+class Box(NamedTuple):
+    """A pencil with the same lowest eigenpairs as a given one, on the box around its domain.
+
+    Attributes:
+        pencil: the pencil.
+        space: the space of the unknowns of the given pencil, on the nodes of the box.
+    """
+
+    pencil: Pencil
+    space: FunctionSpace
+
+    def into(self, rows: Float[Array, "m n_dof"]) -> Float[Array, "m n_box"]:
+        """Return functions of the given unknowns as those of the box."""
+        return self.space.transfer(rows, self.pencil.space)
+
+    def out_of(self, rows: Float[Array, "m n_box"]) -> Float[Array, "m n_dof"]:
+        """Return functions of the box as those of the given unknowns."""
+        return self.pencil.space.transfer(rows, self.space)
+
+
+def in_box(pencil: Pencil, k: int) -> Box:
+    """Return the box whose pencil has the same k lowest eigenpairs, for solvers that compute on all of its nodes."""
+    inner = cropped(pencil)
+    return Box(_on_all_nodes(inner, k), inner.space)
 
 
 def cropped(pencil: Pencil) -> Pencil:
@@ -41,7 +67,7 @@ def cropped(pencil: Pencil) -> Pencil:
     return replace(pencil, **parts, metric=None, density=None, source=None)
 
 
-def in_box(pencil: Pencil, k: int) -> Pencil:
+def _on_all_nodes(pencil: Pencil, k: int) -> Pencil:
     """Return a pencil with the same k lowest eigenpairs whose unknowns are all nodes of the grid, or the given pencil.
 
     Each node i that is not free gets a separate equation: in row i of both matrices, only the diagonal entries Mᵢᵢ = m

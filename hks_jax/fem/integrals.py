@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hks_jax.checks import real_array
 from hks_jax.compilation import jit_quickly, library_of, numpy_where_known
 from hks_jax.domain import spd
 from hks_jax.domain.grid import Grid
@@ -274,33 +273,6 @@ def _in_slabs(
     none = jnp.zeros((3 ** (1 + len(others)), count + 1, *(n + 1 for n in others)), dtype)
     total, _ = jax.lax.scan(add, (none, none, jnp.zeros((), dtype)), jnp.arange(-(-count // planes)))
     return total
-
-
-def mesh_nodes(mesh: SimplicialMesh, degree: int, midpoints: Any) -> Float[Array, "nodes 3"]:
-    """Return the positions of the nodes: the vertices and, for degree 2, the midpoints of the edges."""
-    if degree not in (1, 2):
-        raise ValueError(f"degree: got {degree!r}; expected 1 or 2")
-    vertices = mesh.vertices
-    if degree == 1:
-        if midpoints is not None:
-            raise ValueError("midpoints: got positions with degree=1, whose edges are straight; pass degree=2")
-        return vertices
-    middles = jnp.mean(vertices[mesh.triangulation.edges], axis=1)
-    if midpoints is None:
-        return jnp.concatenate([vertices, middles])
-    if mesh._metric is not None:
-        raise ValueError("midpoints: got positions for a mesh with a given metric; leave out midpoints or metric")
-    moved = midpoints
-    if callable(midpoints):
-        on_surface = mesh.triangulation.boundary_edges | (mesh.triangulation.dimension == 2)
-        moved = middles.at[on_surface].set(jax.vmap(midpoints)(middles[on_surface]))
-    moved = real_array("midpoints", moved)
-    if moved.shape != middles.shape:
-        raise ValueError(
-            f"midpoints: got shape {moved.shape}; expected {middles.shape}, one position for each edge of "
-            "mesh.triangulation.edges, or a function that maps an edge's midpoint (3,) to its new position"
-        )
-    return jnp.concatenate([vertices, moved.astype(vertices.dtype)])
 
 
 def mesh_points(nodes: Float[Array, "nodes 3"], space: MeshSpace) -> Float[Array, "n q 3"]:

@@ -34,8 +34,8 @@ def problems_of(
         mirrored = False
     else:
         sides = sides_of(domain.grid, boundary)
-        spaces = _spaces(lambda problem: grid_space(domain.grid, problem), doubled_problems(sides), boundary)
-        mirrored = any("mirror" in pair for pair in sides)
+        problems, mirrored = doubled_problems(sides), any("mirror" in pair for pair in sides)
+        spaces = _spaces(lambda problem: grid_space(domain.grid, problem), problems, boundary)
     if len(spaces) > 1 and spaces[0].n_dof == spaces[-1].n_dof:  # all problems are the same
         raise ValueError(
             'boundary: got "mirror", but the mask reaches no side of the grid, where the mirrors are. Pass "mean" '
