@@ -266,7 +266,7 @@ def test_a_unit_that_is_asked_for_overrides_the_sidecar(tmp_path):
 
 @pytest.mark.parametrize("name", ["t.nii.gz", "t.nrrd"])
 def test_an_unknown_unit_of_length_stays_unknown(tmp_path, name):
-    """Tensors of NumPy's files, such as a metric, have no unit; a file that called them mm would suggest a wrong one."""
+    """Tensors of NumPy's files, such as a metric, have no unit; with lengths in mm, another unit would be suggested."""
     if name.endswith(".nrrd"):
         pytest.importorskip("nrrd")
     affine = np.diag([2.0, 2.0, 2.0, 1.0])
