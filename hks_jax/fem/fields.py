@@ -105,9 +105,10 @@ def _placed(
         inside = np.broadcast_to(elements[..., None], x.shape[:-1])
         return values.reshape(*x.shape[:-1], *values.shape[1:]), "points", inside
     values = real_array(name, given)
-    at_vertices = isinstance(space, MeshSpace) and values.shape[:1] == (space.triangulation.n_vertices,)
-    if at_vertices and space.degree == 2 and not of_cells:
-        values = jnp.concatenate([values, jnp.mean(values[space.triangulation.edges], axis=1)])
+    if isinstance(space, MeshSpace) and space.degree == 2 and not of_cells:
+        triangulation = space.triangulation
+        if values.shape[:1] == (triangulation.n_vertices,):
+            values = jnp.concatenate([values, jnp.mean(values[triangulation.edges], axis=1)])
     if values.ndim == 0:
         return values, "everywhere", None
     if values.shape[: len(nodes)] == nodes and not of_cells:
