@@ -33,7 +33,9 @@ def disc():
 @pytest.fixture
 def tensors(tmp_path):
     field = np.where(disc()[..., None, None], D * (1 + 0.1 * np.indices(SHAPE)[0][..., None, None]), 0)
-    return save_tensors(tmp_path / "t.nii.gz", TensorVolume(field, (2.0, 2.0, 3.0), (0.0,) * 3, affine=AFFINE))
+    return save_tensors(
+        tmp_path / "t.nii.gz", TensorVolume(field, (2.0, 2.0, 3.0), (0.0,) * 3, affine=AFFINE, length_unit="mm")
+    )
 
 
 @pytest.fixture

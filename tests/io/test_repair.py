@@ -145,7 +145,9 @@ def tissue(**units):
     )
     tensors = values[..., None] * np.eye(3)
     tensors[1, 2, 3] = np.diag([8e-4, 6e-4, 1.08e-9])
-    return TensorVolume(tensors, (2.0, 2.0, 2.0), (0.0,) * 3, affine=np.eye(4), **{"length_unit": "mm", **units})
+    return TensorVolume(
+        tensors, (2.0, 2.0, 2.0), (0.0,) * 3, affine=np.diag([2.0, 2, 2, 1]), **{"length_unit": "mm", **units}
+    )
 
 
 @pytest.mark.parametrize("unit", ["", "mm²/s"])
