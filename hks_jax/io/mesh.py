@@ -47,7 +47,8 @@ def read_mesh(path: str | os.PathLike[str], *, clean: bool = False, in_space: bo
 
     Quadrilaterals are cut into triangles, as are all polygons in polygonal data, PLY, OBJ and OFF. Vertices keep their
     order. In STL, coincident corners of triangles become one vertex. Cells of lower dimension beside tetrahedra are
-    ignored. A warning reports coincident vertices, as at the seams of a texture, because the surface is torn there.
+    ignored. Warnings report coincident vertices, as at the seams of a texture, because the surface is torn there, and
+    vertices at which parts of the mesh touch without a common edge (of a solid, a common triangle).
 
     Args:
         path: the file.
@@ -92,10 +93,10 @@ def load_mesh(path: str | os.PathLike[str], clean: bool = False, in_space: bool 
     remedy = "" if clean else f". {argument('clean', True)} repairs some defects"
     try:
         mesh = make(loaded.vertices, loaded.cells)
-        if not clean:
-            said = _require_joined(loaded)
     except ValueError as error:
         raise ValueError(f"{os.fspath(path)}: {error}{remedy}") from error
+    if not clean:
+        said, remedy = _require_joined(os.fspath(path), loaded, remedy)
     if said:
         warn_of_accuracy(f"{os.fspath(path)}: {said}{remedy}", UserWarning if clean else AccuracyWarning)
     suffix = Path(path).suffix.lower()
@@ -249,23 +250,28 @@ def _same_places(vertices: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, " V"]:
     return first
 
 
-def _require_joined(loaded: Loaded) -> str:
-    """Return a warning if vertices coincide, or ""; raise ValueError if merging them joins pieces of the mesh."""
+def _require_joined(name: str, loaded: Loaded, remedy: str) -> tuple[str, str]:
+    """Return a warning if vertices coincide, or "", and its remedy.
+
+    Raises:
+        ValueError: merging the vertices joins pieces of the mesh.
+    """
     first = _same_places(loaded.vertices)
     doubled = int((first != np.arange(len(first))).sum())
     if not doubled:
-        return ""
-    pieces, joined = (
-        len(np.unique(Triangulation(cells, len(first)).labels[0][cells]))
-        for cells in (loaded.cells, first[loaded.cells])
-    )
+        return "", ""
+    apart, merged = (Triangulation(cells, len(first)) for cells in (loaded.cells, first[loaded.cells]))
+    pieces, joined = (len(np.unique(each.labels[0][each.cells])) for each in (apart, merged))
     what = f"{doubled} of {len(first)} vertices coincide with another vertex"
+    if (points := merged.pinched_vertices.size - apart.pinched_vertices.size) > 0:
+        # Heat flows through a vertex that two parts share, but not through a point.
+        remedy = f". Merging the vertices would leave {points} at which parts touch only in a point: move these apart"
     if joined < pieces:
         raise ValueError(
-            f"vertices: {what}, so the mesh has {pieces} pieces that touch; expected {joined}, the number of pieces "
-            "after coincident vertices are merged"
+            f"{name}: vertices: {what}, so the mesh has {pieces} pieces that touch; expected {joined}, the number of "
+            f"pieces after coincident vertices are merged{remedy}"
         )
-    return f"{what}. The mesh is torn there, as at the seams of a texture, and no heat flows across"
+    return f"{what}. The mesh is torn there, as at the seams of a texture, and no heat flows across", remedy
 
 
 def _cleaned(loaded: Loaded) -> tuple[Loaded, str]:
