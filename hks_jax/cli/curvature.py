@@ -4,7 +4,7 @@ Compute the Gaussian curvature of a two-dimensional field of diffusion tensors, 
 'hks-jax hks'.
 
 The command writes curvature.npz, curvature.png, report.json and an image in the format of FILE (curvature.nii.gz, .nrrd
-or .vti) to the folder OUT.
+or .vti) to the folder OUT. The report has the integral over the domain, if the curvature is known at all its nodes.
 
 examples:
   hks-jax curvature tensor.nii.gz -o out --mask mask.nii.gz --slice z=14 --metric inverse
@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from hks_jax.cli import options
 from hks_jax.cli.combinations import refuse
@@ -24,6 +25,9 @@ from hks_jax.cli.outputs import REPORT, Done, writing
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import Reading, read_volume
 from hks_jax.curvature import gaussian_curvature
+from hks_jax.domain.tensor_field import TensorField
+from hks_jax.fem.assembly import assemble
+from hks_jax.fem.pencil import Pencil
 from hks_jax.io import Result
 from hks_jax.io.formats import WRITTEN, format_of
 
@@ -44,6 +48,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="periodic axes, along which the first node follows the last (default none)",
     )
     options.add_view(parser)
+
+
+def _total(field: TensorField, curvature: Float[np.ndarray, "nx ny"], periodic: str) -> dict[str, float]:
+    """Return the integral of the curvature over the domain; nothing if the curvature is not known everywhere."""
+    conditions = tuple("periodic" if axis in periodic else "neumann" for axis in "xy")
+    pencil = assemble(field, conditions, "lumped")
+    assert isinstance(pencil, Pencil)
+    areas = np.asarray(pencil.space.extend(pencil.mass.diagonal(), outside=0.0), np.float64)
+    values, inside = curvature.astype(np.float64), areas > 0
+    return {"total": float(areas[inside] @ values[inside])} if np.isfinite(values[inside]).all() else {}
 
 
 COLOURED = 0.98
@@ -77,7 +91,6 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         raise ValueError("tensors: finite differences need a grid line with 7 nodes inside the mask; got none")
     if lacking := int((inside & ~known).sum()):
         progress.note(f"the curvature is NaN at {lacking} nodes that are too near the mask's boundary")
-    density = np.sqrt(np.linalg.det(np.asarray(field.domain_tensors, np.float64)))[known]
     values = curvature[known].astype(np.float64)
     report = {
         "input": domain.about,
@@ -88,7 +101,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
             "least": float(values.min()),
             "median": float(np.median(values)),
             "greatest": float(values.max()),
-            "total": float(values @ density * np.prod(field.grid.spacing)),
+            **_total(field, curvature, periodic),
         },
     }
     stale = [args.output / f"curvature{suffix}" for suffix in WRITTEN]

@@ -63,16 +63,16 @@ def read_domain(mesh_file: MeshFile, settings: Settings, progress: Progress) -> 
 
 def _with_metric(mesh_file: MeshFile, volume: TensorVolume | None, settings: Settings, progress: Progress) -> OfMesh:
     file, dtype = mesh_file.file, settings.dtype
-    found = load_mesh(file, mesh_file.clean, in_space=volume is not None)
-    mesh = found.mesh
-    vertices, cells = np.asarray(mesh.vertices).astype(dtype), mesh.triangulation.cells
+    inside = None if mesh_file.inside is None else partial(_inside, mesh_file.inside)
+    try:
+        found = load_mesh(file, mesh_file.clean, volume is not None, inside)
+    except ValueError as error:
+        if inside is None or not str(error).startswith("mask: "):
+            raise
+        raise ValueError(f"--inside: {str(error).removeprefix('mask: ')}") from error
+    mesh, cells, mask = found.mesh, found.cells, found.mask
+    vertices = np.asarray(mesh.vertices).astype(dtype)
     kind: Any = type(mesh)
-    mask = None if mesh_file.inside is None else _inside(mesh_file.inside, len(vertices))
-    if mask is not None:
-        try:
-            kind(vertices, cells, mask=mask)
-        except ValueError as error:
-            raise ValueError(f"--inside: {str(error).removeprefix('mask: ')}") from error
 
     def of_tensors(tensors: Any, at: str = "vertices") -> Mesh:
         how: Any = {"at": at, "operator": settings.operator, "interpolation": settings.interpolation, "mask": mask}
@@ -87,7 +87,7 @@ def _with_metric(mesh_file: MeshFile, volume: TensorVolume | None, settings: Set
         return Domain(mesh, mesh, about, found.written, record, *tensors)
 
     if volume is not None:
-        at = np.arange(len(vertices)) if mask is None else np.flatnonzero(mask)
+        at = np.flatnonzero(mesh.triangulation.used)
 
         def sampled(values: Any) -> Mesh:
             tensors = np.zeros((len(vertices), 3, 3), dtype)
@@ -128,7 +128,8 @@ def describe_mesh(path: Path, mesh: SimplicialMesh) -> dict[str, Any]:
         "median_edge": edge,
     }
     if mesh.metric_of_space is None:
-        size, used = float(np.linalg.norm(np.ptp(vertices, axis=0))), mesh.triangulation.used
+        used = mesh.triangulation.used
+        size = float(np.linalg.norm(np.ptp(vertices[used], axis=0)))
         depth = float(np.median(cKDTree(vertices[rim]).query(vertices[used])[0])) if rim.any() else math.inf
         times = suitable_times(d, measure, edge**2, size, len(vertices), depth=depth)
         facts["suits"] = {{2: "surface", 3: "solid"}[d]: times}

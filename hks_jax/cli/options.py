@@ -316,7 +316,8 @@ def add_vertices(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="FILE",
         help="vertices of a mesh that form the domain, such as a cortical surface without its medial wall: "
-        "FreeSurfer's .label, or zeros and ones in .npy or in the array 'mask' of an .npz",
+        "FreeSurfer's .label, or zeros and ones in .npy or in the array 'mask' of an .npz, in the numbering of the "
+        "file, before --clean. Cells outside may be degenerate or NaN",
     )
 
 

@@ -23,7 +23,7 @@ from hks_jax.curvature.jet import (
     nodal_series,
     over_nodes,
 )
-from hks_jax.curvature.noise import warn_of_noise
+from hks_jax.curvature.noise import warn_of_errors
 from hks_jax.domain.components import wraps_per_axis
 from hks_jax.domain.tensor_field import TensorField, require_field, require_laplace_beltrami
 from hks_jax.traced import is_traced
@@ -62,7 +62,8 @@ def hks_expansion(
     The differences amplify noise and rounding in proportion to h⁻²ⁱ in uᵢ. A grid that is finer by the factor 2 has an
     error by rounding in u₃ that is 64 times larger: on the chart [−1, 1]² of the unit sphere in float64, 6e-8 for
     h = 1/40, 3e-6 for h = 1/80 and 1e-4 for h = 1/160. If noise or rounding dominates a coefficient, and changes the
-    signature by more than 0.1 %, an `AccuracyWarning` states by how much.
+    signature by more than 0.1 %, an `AccuracyWarning` states by how much; another is issued where the grid does not
+    resolve the metric, as for `gaussian_curvature`.
 
     Args:
         field: the metric, d = 2 or 3.
@@ -97,14 +98,17 @@ def hks_expansion(
         negligible = [1e-3 / float(np.asarray(t).max()) ** i for i in range(1, order + 1)]
         names = [f"coefficient u{i} of the expansion" for i in range(1, order + 1)]
         differences = 10 if order > 1 and dimension == 2 else 6
-        again = lambda f: _coefficients(f, int(order), wraps)[1:]  # noqa: E731
-        warn_of_noise(field, again, coefficients[1:], names, negligible, differences)
+        again = lambda f, lower: _coefficients(f, int(order), wraps, lower)[1:]  # noqa: E731
+        warn_of_errors(field, again, coefficients[1:], names, negligible, wraps, differences)
     return _series(coefficients, t, dimension)
 
 
 @partial(jax.jit, static_argnums=(1, 2))
-def _coefficients(field: TensorField, order: int, wraps: tuple[bool, ...]) -> Coefficients:
-    coefficients, known = (_nodal if field.function is None else _exact)(field, order, wraps)
+def _coefficients(field: TensorField, order: int, wraps: tuple[bool, ...], lower: Any = 0) -> Coefficients:
+    if field.function is None:
+        coefficients, known = _nodal(field, order, wraps, lower)
+    else:
+        coefficients, known = _exact(field, order, wraps)
     return [nan_outside(u, known) for u in coefficients]
 
 
@@ -189,20 +193,22 @@ def _invariant_series(E: taylor.Series, F: taylor.Series, G: taylor.Series, orde
     return invariants if order < 3 else (*invariants, laplacian(invariants[1]))
 
 
-def _nodal(field: TensorField, order: int, wraps: tuple[bool, ...]) -> tuple[Coefficients, Bool[np.ndarray, "*shape"]]:
+def _nodal(
+    field: TensorField, order: int, wraps: tuple[bool, ...], lower: Any
+) -> tuple[Coefficients, Bool[np.ndarray, "*shape"]]:
     """Compute the expansion's coefficients by finite differences; also return the nodes where all are known."""
     tensors, inside = field.domain_tensors, domain_nodes(field.grid, wraps)
     if field.grid.dimension == 3:
-        g, known = nodal_jet(tensors, field.grid, inside, wraps)
+        g, known = nodal_jet(tensors, field.grid, inside, wraps, lower)
         R = None
         if order == 2:
-            R, known = nodal_jet(scalar(g), field.grid, known, wraps)
+            R, known = nodal_jet(scalar(g), field.grid, known, wraps, lower)
         return _of_volume(g, R)[: order + 1], known
     components = tensors[..., (0, 0, 1), (0, 1, 1)]
     coefficients, known = [jnp.ones(field.grid.shape, tensors.dtype)], inside
     for i in range(1, order + 1):
         # Each coefficient has the shortest rows that suffice, because longer ones reach further into the domain.
-        series, of_series = nodal_series(components, field.grid, inside, wraps, 2 * i)
+        series, of_series = nodal_series(components, field.grid, inside, wraps, 2 * i, lower)
         coefficients.append(over_nodes(partial(_highest, order=i), series, 2))
         known = known & of_series
     return coefficients, known

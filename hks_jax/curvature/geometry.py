@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +22,7 @@ from hks_jax.curvature.jet import (
     metric_jet,
     nodal_jet,
 )
-from hks_jax.curvature.noise import warn_of_noise
+from hks_jax.curvature.noise import warn_of_errors
 from hks_jax.domain import spd
 from hks_jax.domain.components import wraps_per_axis
 from hks_jax.domain.tensor_field import TensorField, require_field, require_laplace_beltrami
@@ -64,6 +65,9 @@ def gaussian_curvature(field: TensorField, periodic: bool | Sequence[bool] = Fal
     An `AccuracyWarning` is issued if this noise, estimated from differences of the nodes, exceeds half of the
     median of |K|, and 1/area. Then smooth the tensors (`smooth_tensors`), and compute error bars (`uncertainty`).
 
+    An `AccuracyWarning` is also issued if the grid does not resolve the metric: if the error of the differences,
+    estimated by differences of lower order, exceeds a quarter of the median of |K| at over 2 % of the nodes.
+
     Args:
         periodic: whether the axes are periodic, so that node n is node 0; one value for all axes, or one per axis.
 
@@ -87,15 +91,17 @@ def gaussian_curvature(field: TensorField, periodic: bool | Sequence[bool] = Fal
 def _curvature(
     name: str, curvature: Callable[[Jet], Array], field: TensorField, wraps: tuple[bool, ...]
 ) -> Float[Array, "*shape"]:
-    """Return a curvature at the nodes, and warn if noise dominates it."""
+    """Return a curvature at the nodes, and warn if noise dominates it, or if the grid does not resolve the metric."""
     values = _at_nodes(curvature, field, wraps)
-    warn_of_noise(field, lambda f: [_at_nodes(curvature, f, wraps)], [values], [name], [0.0])
+    warn_of_errors(field, lambda f, lower: [_at_nodes(curvature, f, wraps, lower)], [values], [name], [0.0], wraps)
     return values
 
 
 @partial(jax.jit, static_argnums=(0, 2))
-def _at_nodes(curvature: Callable[[Jet], Array], field: TensorField, wraps: tuple[bool, ...]) -> Float[Array, "*shape"]:
-    metric, known = metric_jet(field, wraps)
+def _at_nodes(
+    curvature: Callable[[Jet], Array], field: TensorField, wraps: tuple[bool, ...], lower: Any = 0
+) -> Float[Array, "*shape"]:
+    metric, known = metric_jet(field, wraps, lower)
     return nan_outside(curvature(metric), known)
 
 

@@ -47,13 +47,17 @@ def nodal_jet(
     grid: Grid,
     inside: Bool[np.ndarray, "*shape"],
     wraps: tuple[bool, ...],
+    lower: Any = 0,
 ) -> tuple[Jet, Bool[np.ndarray, "*shape"]]:
-    """Compute the jets of nodal values by finite differences; also return the nodes where all derivatives are known."""
+    """Compute the jets of nodal values by finite differences; also return the nodes where all derivatives are known.
+
+    The order of the differences is lower if `lower` is positive; see `stencils`.
+    """
     _require_nodes(grid, wraps, 2)
     d = grid.dimension
 
     def along(values: Array, inside: np.ndarray, axis: int, orders: range) -> tuple[list[Array], np.ndarray]:
-        return differentiate(values, inside, axis, orders, 2, grid.spacing[axis], wraps[axis])
+        return differentiate(values, inside, axis, orders, 2, grid.spacing[axis], wraps[axis], lower)
 
     lines = [along(values, inside, a, range(1, 3)) for a in range(d)]
     mixed = {(a, b): along(lines[a][0][0], lines[a][1], b, range(1, 2)) for a in range(d) for b in range(a + 1, d)}
@@ -75,16 +79,17 @@ def nodal_series(
     inside: Bool[np.ndarray, "nx ny"],
     wraps: tuple[bool, ...],
     degree: int,
+    lower: Any = 0,
 ) -> tuple[Float[Array, "nx ny *components n_terms"], Bool[np.ndarray, "nx ny"]]:
     """Compute Taylor series of nodal values on a 2D grid by finite differences; also return the nodes with a series.
 
-    The coefficients have the order of `taylor`.
+    The coefficients have the order of `taylor`; `lower` is that of `nodal_jet`.
     """
     _require_nodes(grid, wraps, degree)
 
     def along(values: Array, inside: np.ndarray, axis: int) -> tuple[Array, np.ndarray]:
         orders = range(1, degree + 1)
-        found, known = differentiate(values, inside, axis, orders, degree, grid.spacing[axis], wraps[axis])
+        found, known = differentiate(values, inside, axis, orders, degree, grid.spacing[axis], wraps[axis], lower)
         return jnp.stack([values, *found], axis=-1), known
 
     of_x, known = along(values, inside, 0)
@@ -125,11 +130,11 @@ def metric_function(field: TensorField) -> Callable[[Array], Array]:
     return lambda x: spd.positive_or_nan(spd.symmetrise(jnp.asarray(function(x), x.dtype)))
 
 
-def metric_jet(field: TensorField, wraps: tuple[bool, ...]) -> tuple[Jet, Bool[np.ndarray, "*shape"]]:
+def metric_jet(field: TensorField, wraps: tuple[bool, ...], lower: Any = 0) -> tuple[Jet, Bool[np.ndarray, "*shape"]]:
     """Return a metric and its derivatives at the nodes, and the nodes where the derivatives are known."""
     inside = domain_nodes(field.grid, wraps)
     if field.function is None:
-        return nodal_jet(field.domain_tensors, field.grid, inside, wraps)
+        return nodal_jet(field.domain_tensors, field.grid, inside, wraps, lower)
     function = metric_function(field)
     return at_nodes(lambda x: function_jet(function, x), field.grid, inside), inside
 

@@ -1,4 +1,4 @@
-"""A warning where the noise or the rounding of nodal tensors dominates what is computed from their derivatives."""
+"""Warnings where noise or rounding of nodal tensors dominates their derivatives, or the grid does not resolve them."""
 
 from collections.abc import Callable, Sequence
 from math import comb
@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hks_jax.accuracy import warn_of_accuracy
+from hks_jax.curvature.stencils import centred_nodes
 from hks_jax.domain.grid import Grid
 from hks_jax.domain.tensor_field import TensorField
 from hks_jax.traced import is_traced
@@ -21,29 +22,41 @@ _NORMAL = 1.4826
 """The ratio of the standard deviation of a normal variable with mean zero to the median of its absolute value."""
 _SHARE = 0.5
 """The least ratio of the noise to the median size of a quantity at which noise dominates the quantity."""
+_UNRESOLVED, _NODES = 0.25, 0.02
+"""The error of the differences, relative to the median size of a quantity, that matters at more than this share of the
+nodes."""
+_NEAR_SIDES = 1 / 2
+"""The ratio of errors to their estimate where rows are shifted, whose polynomials have orders that differ by one only;
+it is about 1/4 on charts of the sphere and 1 on those of the hyperbolic plane, with 21 to 81 nodes per axis."""
+_ABOVE = 5
+"""The ratio to the noise above which a change by the order of the differences counts as an error of truncation."""
 _ROUNDING = 100
 """The noise, in machine precisions of the tensors, below which it is called rounding."""
 
 
-def warn_of_noise(
+def warn_of_errors(
     field: TensorField,
-    compute: Callable[[TensorField], Sequence[Array]],
+    compute: Callable[[TensorField, int], Sequence[Array]],
     values: Sequence[Array],
     names: Sequence[str],
     negligible: Sequence[float],
+    wraps: tuple[bool, ...],
     differences: int = 6,
 ) -> None:
-    """Warn about the first of several quantities at the nodes that is dominated by noise of the tensors.
+    """Warn about the first of several quantities at the nodes that is dominated by noise of the tensors, or unresolved.
 
     The noise of a quantity is the median size of its change if noise of the estimated level is added to the tensors.
+    With differences of three orders of accuracy, the quantity changes by d₁ from the highest to the second, and by d₂
+    from there to the lowest. Its error of truncation is about d₁ · d₁/d₂, as in a geometric series, and at most d₁.
 
     Args:
         field: the metric; nothing is done for a function, or if it is traced.
-        compute: returns the quantities of a field.
+        compute: returns the quantities of a field, by differences whose order is lower by 0, 1 or 2 steps.
         values: the quantities of `field`.
         names: the names of the quantities.
         negligible: the noise of each quantity that does not matter; at least 1/V^(2/d) counts as such for the first,
             the curvature, since smaller curvatures change nothing in a domain of the volume V.
+        wraps: whether each axis is periodic.
         differences: the order of the differences that show the noise. It must exceed the order of the derivatives.
     """
     if field.function is not None or is_traced((field, list(values))):
@@ -58,12 +71,15 @@ def warn_of_noise(
     white = np.random.default_rng(0).normal(size=tensors.shape)
     noise = level * (white + np.swapaxes(white, -1, -2)) / 2 * _mean(tensors)[..., None, None]
     noisy = eqx.tree_at(lambda f: f._tensors, field, jnp.asarray(tensors + noise.astype(tensors.dtype)))
-    for name, value, other, least in zip(names, values, compute(noisy), negligible, strict=True):
+    noises = []
+    for name, value, other, least in zip(names, values, compute(noisy, 0), negligible, strict=True):
         change_at, size_at = np.abs(np.asarray(other - value, np.float64)), np.abs(np.asarray(value, np.float64))
         known = np.isfinite(change_at)
         if not known.any():
+            noises.append(0.0)
             continue
         size, change = np.median(size_at[known]), np.median(change_at[known])
+        noises.append(float(change))
         if change <= max(least or floor, _SHARE * size):
             continue
         told = f"the {name} has an error of about {change:.2g} by "
@@ -81,6 +97,28 @@ def warn_of_noise(
                 "hks_jax.uncertainty"
             )
         return
+    of_orders = (
+        [np.asarray(each, np.float64) for each in values],
+        *([np.asarray(each, np.float64) for each in compute(field, lower)] for lower in (1, 2)),
+    )
+    for name, least, noise_of, *found in zip(names, negligible, noises, *of_orders, strict=True):
+        known = np.isfinite(found).all(axis=0)
+        if not known.any():
+            continue
+        high, middle, low = (each[known] for each in found)
+        first, second = np.abs(high - middle), np.abs(middle - low)
+        error = first * np.minimum(first / np.maximum(second, np.finfo(float).tiny), 1)
+        error = np.where(centred_nodes(inside, wraps)[known], error, _NEAR_SIDES * error)
+        size = np.median(np.abs(high))
+        share = np.mean(error > max(_UNRESOLVED * size, least or floor, _ABOVE * noise_of))
+        if share > _NODES:
+            warn_of_accuracy(
+                f"the {name} is not resolved by the grid at {share:.1%} of the nodes: by differences of lower order, "
+                f"its error there exceeds {_UNRESOLVED:.0%} of its median size {size:.2g} (the greatest value is "
+                f"{np.abs(high).max():.2g}). Use a finer grid, a smaller domain, smoother tensors, or a metric from "
+                "TensorField.from_function, whose derivatives are exact"
+            )
+            return
 
 
 def _mean(tensors: Float[np.ndarray, "*shape d d"]) -> Float[np.ndarray, "*shape"]:

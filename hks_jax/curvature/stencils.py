@@ -3,13 +3,18 @@
 from fractions import Fraction
 from functools import lru_cache
 from math import factorial
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hks_jax.traced import is_traced
+
 NODES = {2: 7, 4: 11, 6: 13}
 """The number of nodes of a row, for derivatives up to the second, fourth and sixth order."""
+_LOWER = 2
+"""The greatest reduction of the order of accuracy."""
 DEGREE = 4
 """The degree of the polynomial in a row near a side, for the first and second derivative."""
 
@@ -24,8 +29,11 @@ DEGREE = 4
 # For the fourth and sixth derivative, a shifted row would either amplify noise or have a truncation error that only
 # very fine grids make small. These derivatives have centred rows only.
 @lru_cache
-def stencils(highest: int) -> tuple[np.ndarray, np.ndarray]:
+def stencils(highest: int, lower: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Return the stencils of the derivatives up to the order `highest`: the centred one first, others by their shift.
+
+    The order of accuracy is lower by 2 · `lower` in the centred row, which leaves out `lower` nodes at each end, and by
+    `lower` in the others.
 
     Row i of the offsets (n, nodes) and entry [i, order] of the weights (n, highest + 1, nodes) belong to stencil i, for
     unit spacing.
@@ -33,8 +41,9 @@ def stencils(highest: int) -> tuple[np.ndarray, np.ndarray]:
     n = NODES[highest]
     shifts = sorted(range(-n + 1, 1), key=lambda shift: abs(2 * shift + n - 1)) if highest == 2 else [-(n // 2)]
     offsets = np.add.outer(shifts, np.arange(n)).astype(np.int32)
-    weights = [_weights(run, n - 1 if i == 0 else DEGREE, highest) for i, run in enumerate(offsets)]
-    return offsets, np.stack(weights)
+    inner = slice(lower, n - lower)
+    centred = np.pad(_weights(offsets[0][inner], n - 1 - 2 * lower, highest), ((0, 0), (lower, lower)))
+    return offsets, np.stack([centred, *(_weights(run, DEGREE - lower, highest) for run in offsets[1:])])
 
 
 def _weights(run: np.ndarray, degree: int, highest: int) -> Float[np.ndarray, "orders nodes"]:
@@ -61,12 +70,15 @@ def differentiate(
     highest: int,
     spacing: float,
     wraps: bool,
+    lower: Any = 0,
 ) -> tuple[list[Float[Array, "*shape_and_components"]], Bool[np.ndarray, "*shape"]]:
     """Return derivatives of nodal values along a grid axis, one per order, and the nodes where they are known.
 
-    Only values at nodes inside the domain are used. Derivatives are 0 where no stencil of `highest` lies in the domain.
+    `lower` is that of `stencils`, at most 2, and may be traced. Only values at nodes inside the domain are used.
+    Derivatives are 0 where no stencil of `highest` lies in the domain.
     """
-    offsets, weights = stencils(highest)
+    offsets, tables_of = stencils(highest)[0], np.stack([stencils(highest, i)[1] for i in range(_LOWER + 1)])
+    weights = jnp.asarray(tables_of, values.dtype)[lower] if is_traced(lower) else tables_of[lower]
     n, d = inside.shape[axis], inside.ndim
     along = [n if a == axis else 1 for a in range(d)]
     # Without a mask, all grid lines along the axis have the same stencils, which are chosen for one line.
@@ -82,6 +94,12 @@ def differentiate(
     valid = np.broadcast_to(valid, inside.shape)
     # Unknown derivatives are zero and not NaN, since 0·NaN would spoil the gradient of known derivatives.
     return [jnp.where(np.expand_dims(valid, expand), total, 0) for total in totals], valid
+
+
+def centred_nodes(inside: Bool[np.ndarray, "*shape"], wraps: tuple[bool, ...]) -> Bool[np.ndarray, "*shape"]:
+    """Return the nodes at which the first and second derivative along each axis have the centred row."""
+    offsets = stencils(2)[0]
+    return np.logical_and.reduce([_choose(inside, offsets, axis, w)[0] == 0 for axis, w in enumerate(wraps)])
 
 
 def _choose(

@@ -107,8 +107,8 @@ def signed_measure(
 def check_places(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulation) -> None:
     """Raise ValueError for vertices that are not finite, and for degenerate, inverted or overlapping simplices.
 
-    Two triangles overlap if they have the same vertices. Warn if three triangles of a surface share an edge, or if an
-    edge of a surface passes through a vertex.
+    Two triangles overlap if they have the same vertices. Warn if three triangles of a surface share an edge, if an edge
+    of a surface passes through a vertex, or if parts of a mesh touch only at vertices.
     """
     infinite = triangulation.used & ~np.isfinite(vertices).all(axis=1)
     if infinite.any():
@@ -132,7 +132,8 @@ def check_places(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulatio
                 f"faces: {crowded.size} edges belong to three triangles or more (the first has the vertices {edge}): "
                 "heat flows into all branches of the surface there. To avoid this, keep at most two triangles per edge"
             )
-        _warn_of_hanging(vertices, triangulation)
+        if not _warn_of_hanging(vertices, triangulation):  # parts also touch at the ends of a crack
+            _warn_of_pinched(triangulation)
         return
     inverted = measure < 0
     if inverted.any():
@@ -148,6 +149,23 @@ def check_places(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulatio
         raise ValueError(
             f"cells: {len(overlaps)} pairs of tetrahedra overlap, as they lie on one side of a common triangle (the "
             f"first pair is cells {a} and {b}); remove duplicates, or move the vertices of a folded mesh apart"
+        )
+    _warn_of_pinched(triangulation)
+
+
+def _warn_of_pinched(triangulation: Triangulation) -> None:
+    """Warn if parts of a mesh touch only at vertices (of a solid, also along edges)."""
+    found = triangulation.pinched_vertices
+    if found.size:
+        words, first = WORDS[triangulation.dimension], int(found[0])
+        shared = {2: "an edge", 3: "a triangle"}[triangulation.dimension]
+        cells = np.flatnonzero((triangulation.cells == first).any(axis=1))
+        listed = ", ".join(map(str, cells[:8])) + " …" * (cells.size > 8)
+        warn_of_accuracy(
+            f"{words.argument}: at {found.size} vertices, parts of the mesh touch without sharing {shared} there (the "
+            f"first is vertex {first}, with the {words.argument} {listed}). No heat flows through a point, but it "
+            "flows through a common vertex, the more the coarser the mesh: results depend on the mesh. Give each part "
+            f"a vertex of its own there, or join the parts by {words.simplices} that share {shared}"
         )
 
 
@@ -176,12 +194,15 @@ def _check_once(faces: Int[np.ndarray, "F 3"]) -> None:
         )
 
 
-def _warn_of_hanging(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulation) -> None:
-    """Warn if a vertex lies between the ends of a boundary edge, so that the triangles on both sides do not connect."""
+def _warn_of_hanging(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulation) -> bool:
+    """Warn if a vertex lies between the ends of a boundary edge, so that the triangles on both sides do not connect.
+
+    Returns whether there is such a vertex.
+    """
     edges = triangulation.facet_vertices(triangulation.boundary_facets)
     rim = np.unique(edges)
     if not rim.size:
-        return
+        return False
     start, end = vertices[edges[:, 0]], vertices[edges[:, 1]]
     length = np.linalg.norm(end - start, axis=1)
     near = scipy.spatial.cKDTree(vertices[rim]).query_ball_point((start + end) / 2, length * (0.5 + _ON_EDGE))
@@ -200,3 +221,4 @@ def _warn_of_hanging(vertices: Float[np.ndarray, "V 3"], triangulation: Triangul
             f"vertex {vertex[first]}, on the edge of the vertices {edges[which[first]].tolist()}): the surface is torn "
             "at these edges, and no heat flows across them. Split the triangle of each edge at the vertex on it"
         )
+    return bool(hanging.size)

@@ -104,8 +104,11 @@ class SimplicialMesh(eqx.Module):
         metric = of_diffusion(metric, operator)
         object.__setattr__(mesh, "operator", operator)
         checked_interpolation(interpolation)
-        array, edges, triangulation = real_array("tensors", mesh.restrict(tensors)), mesh._edges, mesh.triangulation
-        at_vertices = _place(array.shape, triangulation, at) == "vertices"
+        edges, triangulation = mesh._edges, mesh.triangulation
+        # The place is known from the shape before cells are removed: afterwards there may be as many as vertices.
+        all_cells = len(triangulation.cells) if mesh._mask is None else mesh._mask.value.size
+        at_vertices = _place(np.shape(tensors), triangulation, at, all_cells) == "vertices"
+        array = real_array("tensors", tensors if at_vertices else mesh.restrict(tensors))
         if not is_traced((array, edges)):
             _check_tensors(np.asarray(array), np.asarray(edges), triangulation, at_vertices)
         corners = triangulation.cells if at_vertices else np.arange(len(array))[:, None]
@@ -283,10 +286,14 @@ def _orthonormal(edges: Any) -> Any:
     return xp.stack([first, second / xp.linalg.norm(second, axis=-1, keepdims=True)], axis=-1)
 
 
-def _place(shape: tuple[int, ...], triangulation: Triangulation, at: str | None) -> str:
-    """Return whether tensors of this shape belong to the vertices or to the cells (the faces of a surface)."""
+def _place(shape: tuple[int, ...], triangulation: Triangulation, at: str | None, all_cells: int) -> str:
+    """Return whether tensors of this shape belong to the vertices or to the cells (the faces of a surface).
+
+    Tensors of cells are those of all cells, or only of the cells inside a mask.
+    """
     words = WORDS[triangulation.dimension]
-    counts = {words.argument: len(triangulation.cells), "vertices": triangulation.n_vertices}
+    of_cells = all_cells if shape[:1] == (all_cells,) else len(triangulation.cells)
+    counts = {words.argument: of_cells, "vertices": triangulation.n_vertices}
     if at not in (None, *counts):
         raise ValueError(f'at: got {at!r}; expected "{words.argument}", "vertices" or None')
     fitting = [place for place, n in counts.items() if shape == (n, 3, 3) and at in (None, place)]

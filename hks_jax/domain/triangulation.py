@@ -85,6 +85,32 @@ class Triangulation(ByKey):
         return order[starts[np.diff(np.append(starts, order.size)) > 2]]
 
     @cached_property
+    def pinched_vertices(self) -> Int[np.ndarray, " m"]:
+        """The vertices whose cells form several groups that touch only there: cells of a group are joined by facets.
+
+        In a solid whose cells do not overlap, these vertices are on the boundary; others are not examined.
+        """
+        order, begins, _ = self._grouped_facets
+        d, vertices = self.dimension, self.cells.ravel()
+        known = np.ones(vertices.size, bool) if d == 2 else self.boundary_vertices[vertices]
+        # The graph has a node for each corner of each cell, and an edge between equal corners of adjacent cells.
+        again, ends = np.flatnonzero(~begins), []
+        if d == 3:
+            again = again[self.boundary_vertices[self.facet_vertices(order[again])].any(axis=1)]
+        for facet in (order[again - 1], order[again]):
+            cell, corner = np.divmod(facet, d + 1)
+            corners = cell[:, None] * (d + 1) + FACETS[d][corner]
+            ends.append(np.take_along_axis(corners, np.argsort(vertices[corners], axis=1), axis=1).ravel())
+        rows, cols = ends
+        kept, number = known[rows], np.cumsum(known) - 1
+        edges = number[rows[kept]], number[cols[kept]]
+        graph = coo_matrix((np.ones(len(edges[0]), np.int8), edges), shape=(int(known.sum()),) * 2)
+        count, group = connected_components(graph, directed=False)
+        vertex_of = np.zeros(count, np.int64)
+        vertex_of[group] = vertices[known]
+        return np.flatnonzero(np.bincount(vertex_of, minlength=self.n_vertices) > 1)
+
+    @cached_property
     def boundary_vertices(self) -> Bool[np.ndarray, " V"]:
         """Whether each vertex is on a facet that belongs to only one cell, bool (V,)."""
         return np.isin(np.arange(self.n_vertices), self.facet_vertices(self.boundary_facets))

@@ -195,11 +195,6 @@ def _assembled(
                 'mass: got "lumped" with degree=2, where row sums at the vertices are not positive. Use "consistent"'
             )
         points, dtype = partial(mesh_points, nodes), nodes.dtype
-        at_vertices = (domain.triangulation.n_vertices,)
-        given = {
-            name: value if callable(value) or np.shape(value)[:1] == at_vertices else domain.restrict(value)
-            for name, value in given.items()
-        }
         pencil_on = partial(assemble_mesh, domain, nodes, midpoints is not None)
         pencils_on: Callable[..., list[Pencil]] = partial(_on_each, pencil_on)
     else:
@@ -218,6 +213,11 @@ def _assembled(
     built_in, held = not operator.custom, {}
     for name, value in given.items():
         settings = {"scalar": built_in, "positive": built_in and name == "density"}
+        if isinstance(domain, SimplicialMesh) and not callable(value):
+            # The place is known from the shape before cells are removed: afterwards there may be as many as vertices.
+            at_nodes = ((domain.triangulation.n_vertices,), spaces[0].node_shape)
+            settings["of_cells"] = np.shape(value)[:1] not in at_nodes
+            value = domain.restrict(value) if settings["of_cells"] else value
         held[name] = checked_field(name, value, spaces[0], partial(points, spaces[0]), dtype, **settings)
     operator = operator._replace(checked=built_in or not is_traced((domain, held, nodes)))
     pencils = pencils_on(held, spaces, operator)

@@ -49,8 +49,11 @@ def checked_field(
     *,
     scalar: bool = False,
     positive: bool = False,
+    of_cells: bool = False,
 ) -> Field:
     """Return the `Field` of a number, an array over nodes or elements, or a function of position.
+
+    An array that fits both has nodal values, unless it is known to be of the cells of a mesh.
 
     Values outside the domain are ignored. If a field must be positive, traced values that are not positive become NaN.
     Functions are evaluated at the quadrature points; `positions` is called only for functions.
@@ -58,7 +61,7 @@ def checked_field(
     Raises:
         ValueError: another shape; values that are NaN, infinite or not positive (the message has their number).
     """
-    values, at, inside = _placed(name, given, space, positions)
+    values, at, inside = _placed(name, given, space, positions, of_cells)
     # If a field has several numbers at each place, a place with one wrong number counts as wrong.
     rest = values.ndim - (0 if inside is None else inside.ndim)
     if scalar and rest:
@@ -89,7 +92,11 @@ def checked_field(
 
 
 def _placed(
-    name: str, given: Any, space: FunctionSpace, positions: Callable[[], Float[Array, "*elements q m"]]
+    name: str,
+    given: Any,
+    space: FunctionSpace,
+    positions: Callable[[], Float[Array, "*elements q m"]],
+    of_cells: bool,
 ) -> tuple[Array, Place, Bool[np.ndarray, "..."] | None]:
     nodes, elements = space.node_shape, space.elements
     if callable(given):
@@ -98,11 +105,13 @@ def _placed(
         inside = np.broadcast_to(elements[..., None], x.shape[:-1])
         return values.reshape(*x.shape[:-1], *values.shape[1:]), "points", inside
     values = real_array(name, given)
-    if isinstance(space, MeshSpace) and space.degree == 2 and values.shape[:1] == (space.triangulation.n_vertices,):
-        values = jnp.concatenate([values, jnp.mean(values[space.triangulation.edges], axis=1)])
+    if isinstance(space, MeshSpace) and space.degree == 2 and not of_cells:
+        triangulation = space.triangulation
+        if values.shape[:1] == (triangulation.n_vertices,):
+            values = jnp.concatenate([values, jnp.mean(values[triangulation.edges], axis=1)])
     if values.ndim == 0:
         return values, "everywhere", None
-    if values.shape[: len(nodes)] == nodes:
+    if values.shape[: len(nodes)] == nodes and not of_cells:
         return values, "nodes", space.domain
     if values.shape[: elements.ndim] == elements.shape:
         return values, "elements", elements

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from hks_jax.domain.grid import per_axis
 from hks_jax.io.tensor_order import Matrices, matrices, to_voxel_axes
 from hks_jax.io.units import in_mm2_per_s, unit_in
-from hks_jax.io.volume import Format, TensorVolume, describe_tensors, mask_in_file
+from hks_jax.io.volume import Format, TensorVolume, describe_tensors, mask_in_file, spacing_of
 from hks_jax.storage import load_npy, load_npz, write_npz
 
 
@@ -60,17 +60,26 @@ def _read_tensors(
 
 
 def volume_of(name: str, arrays: Mapping[str, Any], tensors: Float[np.ndarray, "..."], **about: Any) -> TensorVolume:
-    """Return a volume of `tensors` with the arrays of `place_of`; by default, spacing is 1 and origin is 0."""
+    """Return a volume of `tensors` with the arrays of `place_of`.
+
+    By default, spacing is that of the affine or, without an affine, 1; and origin is 0.
+    """
     mask, affine, axis = (arrays.get(name) for name in ("mask", "affine", "slice_axis"))
     d, text = tensors.shape[-1] if tensors.ndim else 0, _text(arrays, "unit")
-    unit = unit_in(text)
+    unit, spacing = unit_in(text), arrays.get("spacing")
+    affine = None if affine is None else _real(f"{name}: affine", affine)
+    axis = None if axis is None else np.asarray(axis).tolist()
+    if spacing is None:  # `TensorVolume` refuses an affine and an axis that are wrong
+        spacing = 1.0
+        if affine is not None and affine.shape == (4, 4) and axis in (None, 0, 1, 2):
+            spacing = spacing_of(affine, d, axis)
     volume = TensorVolume(
         tensors,
-        per_axis(f"{name}: spacing", arrays.get("spacing", 1.0), d),
+        per_axis(f"{name}: spacing", spacing, d),
         per_axis(f"{name}: origin", arrays.get("origin", 0.0), d),
         None if mask is None else mask_in_file(f"{name}: mask", mask),
-        None if affine is None else _real(f"{name}: affine", affine),
-        None if axis is None else np.asarray(axis).tolist(),
+        affine,
+        axis,
         length_unit=_text(arrays, "length_unit"),
         unit=text if unit is None else "",
         **about,

@@ -61,8 +61,8 @@ def read_tensors(
       optional array ``mask``. An image one voxel thick gives 2×2 tensors if the components across its plane are zero.
     - npz: the array ``tensors`` (nx, ny, 2, 2) or (nx, ny, nz, 3, 3), where array axis a runs along coordinate a. If
       `order` is given, ``tensors`` may also have the shape (nx, ny, 3) or (nx, ny, nz, 6). An npz may also contain
-      ``spacing`` (d,), which is 1 by default, ``origin`` (d,), which is 0 by default, ``mask`` (*shape,), ``affine``
-      (4, 4), ``slice_axis``, ``order`` and ``frame``. An npy file has only the tensors.
+      ``spacing`` (d,), which is that of the affine or else 1 by default, ``origin`` (d,), which is 0 by default,
+      ``mask`` (*shape,), ``affine`` (4, 4), ``slice_axis``, ``order`` and ``frame``. An npy file has only the tensors.
 
     Args:
         path: the path of the file, or the paths of six images of one component each.

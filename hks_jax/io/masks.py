@@ -92,7 +92,12 @@ def read_labels(path: str | os.PathLike[str], on: TensorVolume | SimplicialMesh)
             place = np.insert(np.delete(place, 2, axis=1), on.thin_axis, place[:, 2], axis=1)
         values = at_voxels(name, values, np.linalg.solve(place, affine), on)
     if values.shape != shape:
-        raise ValueError(f"{name}: got labels of shape {values.shape}; expected the shape of the image, {shape}")
+        expected = f"the shape of the image, {shape}"
+        if not isinstance(on, TensorVolume):
+            expected = (
+                f"{shape}, one for each vertex of the result. Cleaning a mesh removes vertices and renumbers them"
+            )
+        raise ValueError(f"{name}: got labels of shape {values.shape}; expected {expected}")
     if not np.isfinite(values).all() or not np.array_equal(values, np.rint(values)):
         raise ValueError(f"{name}: got fractional numbers; expected integer labels. Resample by the nearest neighbour")
     return np.asarray(values).astype(np.int32)

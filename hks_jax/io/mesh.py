@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from hks_jax.accuracy import AccuracyWarning, warn_of_accuracy
-from hks_jax.domain.simplices import WORDS, signed_measure
+from hks_jax.domain.simplices import WORDS, checked_cells, checked_mask, signed_measure
 from hks_jax.domain.simplicial_mesh import SimplicialMesh, SurfaceMesh, TetMesh
 from hks_jax.domain.triangulation import Triangulation
 from hks_jax.io import cortex
@@ -38,7 +38,9 @@ _THIN = 1e-7
 """The height of a triangle, relative to its longest edge, up to which that edge is flipped."""
 
 
-def read_mesh(path: str | os.PathLike[str], *, clean: bool = False, in_space: bool = False) -> SurfaceMesh | TetMesh:
+def read_mesh(
+    path: str | os.PathLike[str], *, clean: bool = False, in_space: bool = False, mask: Any = None
+) -> SurfaceMesh | TetMesh:
     """Read a mesh of tetrahedra or, if the file has none, of triangles.
 
     meshio reads ``.vtk``, ``.vtu``, Gmsh's ``.msh`` and ``.stl``; VTK reads polygonal data in ``.vtk`` and
@@ -47,7 +49,8 @@ def read_mesh(path: str | os.PathLike[str], *, clean: bool = False, in_space: bo
 
     Quadrilaterals are cut into triangles, as are all polygons in polygonal data, PLY, OBJ and OFF. Vertices keep their
     order. In STL, coincident corners of triangles become one vertex. Cells of lower dimension beside tetrahedra are
-    ignored. A warning reports coincident vertices, as at the seams of a texture, because the surface is torn there.
+    ignored. Warnings report coincident vertices, as at the seams of a texture, because the surface is torn there, and
+    vertices at which parts of the mesh touch without a common edge (of a solid, a common triangle).
 
     Args:
         path: the file.
@@ -58,6 +61,8 @@ def read_mesh(path: str | os.PathLike[str], *, clean: bool = False, in_space: bo
         in_space: whether to return the scanner coordinates that images have. FreeSurfer's coordinates are transformed
             by the axes and the centre (c_ras) of their volume, GIFTI's coordinates by the transformation in the file.
             Coordinates in all formats except FreeSurfer's and GIFTI stay unchanged.
+        mask: the domain, as for `SurfaceMesh`: bool, one value for each vertex or for each cell of the file. Cells
+            outside may be degenerate or NaN. With `clean`, the mask is that of the file before it is cleaned.
 
     Raises:
         FileNotFoundError: the file does not exist.
@@ -72,37 +77,53 @@ def read_mesh(path: str | os.PathLike[str], *, clean: bool = False, in_space: bo
         >>> np.allclose(hj.io.read_mesh(path).vertices, sphere.vertices, atol=1e-6)
         True
     """
-    return load_mesh(path, clean, in_space).mesh
+    return load_mesh(path, clean, in_space, None if mask is None else lambda n_vertices: mask).mesh
 
 
 class MeshInFile(NamedTuple):
     """A mesh with the arrays of its file, by their place (``"vertices"``, and ``"faces"`` or ``"cells"``) and name."""
 
     mesh: SurfaceMesh | TetMesh
+    cells: Int[np.ndarray, "n corners"]  # all cells, to which the arrays belong; the mesh has those inside the mask
+    mask: Bool[np.ndarray, " n"] | None  # the cells inside
     arrays: dict[str, dict[str, Float[np.ndarray, "n *components"]]]
     written: tuple[str, ...]  # the suffixes of results on the mesh
     origin: dict[str, str]  # entries of their provenance
 
 
-def load_mesh(path: str | os.PathLike[str], clean: bool = False, in_space: bool = False) -> MeshInFile:
-    """Read a mesh and its arrays; see `read_mesh`."""
-    loaded, said = _load(path, clean, in_space)
+def load_mesh(
+    path: str | os.PathLike[str],
+    clean: bool = False,
+    in_space: bool = False,
+    inside: Callable[[int], Any] | None = None,
+) -> MeshInFile:
+    """Read a mesh and its arrays; see `read_mesh`. The function `inside` returns the mask for a number of vertices."""
+    loaded, said, mask = _load(path, in_space), "", None
+    if inside is not None:
+        # Cleaning renumbers vertices and merges some, so the mask becomes one of cells before.
+        n, d = len(loaded.vertices), loaded.cells.shape[1] - 1
+        mask = checked_mask(inside(n), checked_cells(loaded.cells, n, d, masked=True), n, d)
+    if clean:
+        loaded, said, kept = _cleaned(loaded)
+        mask = None if mask is None else mask[kept]
     maps = is_surface(Path(path)) and not clean  # cleaning may have renumbered the vertices
     make: Callable[..., SurfaceMesh | TetMesh] = SurfaceMesh if loaded.cells.shape[1] == 3 else TetMesh
     remedy = "" if clean else f". {argument('clean', True)} repairs some defects"
     try:
-        mesh = make(loaded.vertices, loaded.cells)
-        if not clean:
-            said = _require_joined(loaded)
+        mesh = make(loaded.vertices, loaded.cells, mask=mask)
     except ValueError as error:
+        if str(error).startswith("mask: "):
+            raise
         raise ValueError(f"{os.fspath(path)}: {error}{remedy}") from error
+    if not clean:
+        said, remedy = _require_joined(os.fspath(path), loaded, mesh.triangulation, remedy)
     if said:
         warn_of_accuracy(f"{os.fspath(path)}: {said}{remedy}", UserWarning if clean else AccuracyWarning)
     suffix = Path(path).suffix.lower()
     if suffix not in WRITTEN or (suffix == ".ply" and isinstance(mesh, TetMesh)):
         suffix = ".vtu"  # the file's format has no values at vertices
     origin = {cortex.STRUCTURE: loaded.structure} if maps and loaded.structure else {}
-    return MeshInFile(mesh, _by_place(loaded), (suffix, cortex.MAPS) if maps else (suffix,), origin)
+    return MeshInFile(mesh, loaded.cells, mask, _by_place(loaded), (suffix, cortex.MAPS) if maps else (suffix,), origin)
 
 
 def read_mesh_arrays(
@@ -135,7 +156,8 @@ def read_mesh_arrays(
         >>> np.allclose(hj.io.read_mesh_arrays(path)["height"], sphere.vertices[:, 2], atol=1e-6)
         True
     """
-    arrays = _by_place(_load(path, clean)[0])
+    loaded = _load(path)
+    arrays = _by_place(_cleaned(loaded)[0] if clean else loaded)
     if at not in arrays:
         raise ValueError(f"at: got {at!r}, but the places of arrays in {os.fspath(path)} are {', '.join(arrays)}")
     return arrays[at]
@@ -209,8 +231,8 @@ def write(
             write_json(path.with_name(f"{path.name}.json"), json.loads(record))
 
 
-def _load(path: str | os.PathLike[str], clean: bool, in_space: bool = False) -> tuple[Loaded, str]:
-    """Return the content of a file, and a text that lists what cleaning changed."""
+def _load(path: str | os.PathLike[str], in_space: bool = False) -> Loaded:
+    """Return the content of a file."""
     readers: dict[str, tuple[str, Callable[[Path], Loaded]]] = {
         ".gii": ("a readable GIFTI surface", partial(cortex.load_gifti, in_space=in_space)),
         ".vtp": ("readable polygonal data", polygonal),
@@ -223,8 +245,7 @@ def _load(path: str | os.PathLike[str], clean: bool, in_space: bool = False) -> 
     kind = _kind_of(Path(path))
     words, load = readers.get(kind, (f"a mesh that meshio can read as {kind}", through_meshio))
     with reading(path, words) as file:
-        loaded = load(file)
-    return _cleaned(loaded) if clean else (loaded, "")
+        return load(file)
 
 
 def _unknown(path: Path) -> Loaded:
@@ -249,27 +270,32 @@ def _same_places(vertices: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, " V"]:
     return first
 
 
-def _require_joined(loaded: Loaded) -> str:
-    """Return a warning if vertices coincide, or ""; raise ValueError if merging them joins pieces of the mesh."""
-    first = _same_places(loaded.vertices)
+def _require_joined(name: str, loaded: Loaded, apart: Triangulation, remedy: str) -> tuple[str, str]:
+    """Return a warning if vertices of the domain coincide, or "", and its remedy; `apart` has the cells of the domain.
+
+    Raises:
+        ValueError: merging the vertices joins pieces of the mesh.
+    """
+    first = _same_places(np.where(apart.used[:, None], loaded.vertices, np.nan))
     doubled = int((first != np.arange(len(first))).sum())
     if not doubled:
-        return ""
-    pieces, joined = (
-        len(np.unique(Triangulation(cells, len(first)).labels[0][cells]))
-        for cells in (loaded.cells, first[loaded.cells])
-    )
+        return "", ""
+    merged = Triangulation(first[apart.cells], len(first))
+    pieces, joined = (len(np.unique(each.labels[0][each.cells])) for each in (apart, merged))
     what = f"{doubled} of {len(first)} vertices coincide with another vertex"
+    if (points := merged.pinched_vertices.size - apart.pinched_vertices.size) > 0:
+        # Heat flows through a vertex that two parts share, but not through a point.
+        remedy = f". Merging the vertices would leave {points} at which parts touch only in a point: move these apart"
     if joined < pieces:
         raise ValueError(
-            f"vertices: {what}, so the mesh has {pieces} pieces that touch; expected {joined}, the number of pieces "
-            "after coincident vertices are merged"
+            f"{name}: vertices: {what}, so the mesh has {pieces} pieces that touch; expected {joined}, the number of "
+            f"pieces after coincident vertices are merged{remedy}"
         )
-    return f"{what}. The mesh is torn there, as at the seams of a texture, and no heat flows across"
+    return f"{what}. The mesh is torn there, as at the seams of a texture, and no heat flows across", remedy
 
 
-def _cleaned(loaded: Loaded) -> tuple[Loaded, str]:
-    """Return the mesh, cleaned as `read_mesh` documents, and a text that lists the changes."""
+def _cleaned(loaded: Loaded) -> tuple[Loaded, str, Int[np.ndarray, " m"]]:
+    """Return the mesh, cleaned as `read_mesh` documents, a text that lists the changes, and which cells are kept."""
     words = WORDS[loaded.cells.shape[1] - 1]
     first, n_cells, done = _same_places(loaded.vertices), len(loaded.cells), []
 
@@ -303,7 +329,7 @@ def _cleaned(loaded: Loaded) -> tuple[Loaded, str]:
     arrays = {name: values[used] for name, values in loaded.arrays.items()}
     of_cells = {name: values[kept] for name, values in loaded.of_cells.items()}
     cleaned = Loaded(loaded.vertices[used], numbered.reshape(cells.shape), arrays, of_cells, loaded.structure)
-    return cleaned, "; ".join(done)
+    return cleaned, "; ".join(done), kept
 
 
 def _without_thin(

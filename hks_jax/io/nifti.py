@@ -28,7 +28,8 @@ SYMMETRIC_MATRIX = 1005
 COMMENT = 6
 """NIfTI's code for a comment in an extension of the header."""
 _LENGTHS = {0: ("", 1.0), 1: ("m", 1e3), 2: ("mm", 1.0), 3: ("um", 1e-3)}
-"""The unit of length for each code in NIfTI's xyzt_units, and its size in mm. Code 0, no unit, is read as mm."""
+"""The unit of length for each code in NIfTI's xyzt_units, and its size in mm. Code 0, no unit, is read as mm
+if another program wrote the file; the record of `save_tensors` tells whether the unit is known."""
 _HEADERS_OF_2 = (b"\x1c\x02\0\0", b"\0\0\x02\x1c")
 """The first bytes of NIfTI-2, the size of its header in both byte orders."""
 SCALAR = {"Type": "scalar"}
@@ -192,7 +193,8 @@ def _tensors_of(name: str, image: Any, voxels: np.ndarray, order: str | None, fr
     if frame is not None and declared_frame not in (None, frame):
         notes.append(f"components read along the {frame} axes, as asked; the file declares the {declared_frame} axes")
     frame = frame or declared_frame or FRAMES[found.order]
-    volume = placed(name, found, frame, affine, unit=record.get("unit", ""))
+    known = {"unit": record.get("unit", ""), "length_unit": record.get("length_unit", "mm")}
+    volume = placed(name, found, frame, affine, **known)
     notes += placement_notes(image)
     stored = np.linalg.norm(np.asarray(image.affine, np.float64)[:3, :3], axis=0)
     if length_unit not in ("", "mm"):
@@ -293,7 +295,7 @@ def _write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra
         write_json(sidecar_of(path), about | ({"Settings": settings} if settings else {}))
     image = optional("nibabel").Nifti1Image(images_of(array, volume), volume.volume_affine)
     image.header["intent_name"] = name[:15].encode()
-    _store(path, image, record)
+    _store(path, image, record, volume.length_unit)
 
 
 def _write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
@@ -303,12 +305,12 @@ def _write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, An
     components = np.where(volume.inside[..., None, None], pack(volume.tensors, "nifti")[..., None, :], 0)
     image = optional("nibabel").Nifti1Image(components, volume.volume_affine)
     image.header.set_intent(SYMMETRIC_MATRIX, (3,))
-    _store(path, image, describe_tensors(volume, "nifti", "voxel", provenance))
+    _store(path, image, describe_tensors(volume, "nifti", "voxel", provenance), volume.length_unit)
 
 
-def _store(path: Path, image: Any, record: str) -> None:
+def _store(path: Path, image: Any, record: str, length_unit: str) -> None:
     nib = optional("nibabel")
-    image.header.set_xyzt_units("mm")
+    image.header.set_xyzt_units(length_unit or "unknown")
     image.header.extensions.append(nib.nifti1.Nifti1Extension("comment", record.encode()))
     with atomic_path(path) as temporary:
         nib.save(image, temporary)

@@ -157,6 +157,10 @@ def _read_tensors(name: str, order: str | None, frame: str | None, confidence: f
     if place.unit not in ("", "mm"):
         notes.append(f"lengths converted from {place.unit}, which the file declares, to mm")
     notes.append(found._replace(of=f" ({label or 'as asked'})").note(frame))
+    # Patient spaces are in mm, except in a file whose own record says that the unit is not known.
+    record, length_unit = own_record(header.get("provenance", "")), "mm" * bool(place.unit or place.signs is not None)
+    if place.unit in ("", "mm"):
+        length_unit = record.get("length_unit", length_unit)
     return TensorVolume(
         np.ascontiguousarray(tensors),
         tuple(spacing.tolist()),
@@ -168,8 +172,8 @@ def _read_tensors(name: str, order: str | None, frame: str | None, confidence: f
         notes=tuple(notes),
         source=name,
         invalid_by_order=found.invalid,
-        length_unit="mm" if place.unit or place.signs is not None else "",  # patient spaces are in mm
-        unit=own_record(header.get("provenance", "")).get("unit", ""),
+        length_unit=length_unit,
+        unit=record.get("unit", ""),
     )
 
 
@@ -214,7 +218,7 @@ def _store(path: Path, array: np.ndarray, volume: TensorVolume, record: str, kin
         header["measurement frame"] = nearest_rotation(linear).T  # NRRD lists this matrix by columns
     elif array.ndim > d:
         directions, kinds = np.concatenate([directions, none]), [*kinds, "list"]
-    if placed or volume.length_unit:
+    if volume.length_unit:
         header["space units"] = ["mm"] * d
     header |= {"space directions": directions, "space origin": origin, "kinds": kinds, "encoding": "gzip"}
     header |= {key: " ".join(map(repr, np.ravel(value).tolist())) for key, value in more.items()}

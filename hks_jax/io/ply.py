@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from hks_jax.io.mesh_formats import Loaded, real_arrays, triangulated
+from hks_jax.storage import UnsuitedError
 
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -42,6 +43,8 @@ class Rows(NamedTuple):
 def load_ply(file: Path) -> Loaded:
     """Load vertices and faces with the numbers at them; ignore other elements and lists."""
     form, elements, body = _parsed(file.read_bytes())
+    declared = {name: properties for name, _, properties in elements}
+    corners = _require_mesh(declared)
     if form == "ascii":
         body = np.array(body.split(), np.float64).tobytes()
     end, found = 0, {}
@@ -50,14 +53,28 @@ def load_ply(file: Path) -> Loaded:
     if body[end:].strip():
         raise ValueError(f"got {len(body)} bytes of elements; expected {end}, as the header declares")
     n_points, n_faces = (sum(len(rows.numbers) for rows in found.get(name, ())) for name in ("vertex", "face"))
-    declared = {name: properties for name, _, properties in elements}
     points, faces = (_columns(found.get(name, []), declared.get(name, [])) for name in ("vertex", "face"))
     vertices = np.stack([points.pop(axis) for axis in "xyz"], axis=-1).astype(np.float64)
-    corners = [p.name for p in declared.get("face", ()) if p.name in _CORNERS and p.length]
-    polygons = [(rows.numbers, _integers(rows.values[corners[0]])) for rows in found.get("face", ())]
+    polygons = [(rows.numbers, _integers(rows.values[corners])) for rows in found.get("face", ())]
     loaded, face = triangulated(vertices, polygons)
     of_faces = {name: values[face] for name, values in real_arrays(faces, n_faces).items()}
     return loaded._replace(arrays=real_arrays(points, n_points), of_cells=of_faces)
+
+
+def _require_mesh(declared: dict[str, list[Property]]) -> str:
+    """Return the name of the list of a face's corners; raise UnsuitedError unless vertices and faces have all parts."""
+    points, faces = declared.get("vertex", []), declared.get("face", [])
+    corners = [p.name for p in faces if p.name in _CORNERS and p.length]
+    if not {"x", "y", "z"} <= {p.name for p in points if not p.length} or not corners:
+        has = "; ".join(
+            f"{name}: {', '.join(f'list {p.name}' if p.length else p.name for p in there) or 'none'}"
+            for name, there in (("vertex", points), ("face", faces))
+        )
+        raise UnsuitedError(
+            f"got the properties {has}; expected x, y, z of each vertex and a list {' or '.join(_CORNERS)} of each "
+            "face. A mesh of triangles is needed, not a cloud of points or triangle strips; export it as such"
+        )
+    return corners[0]
 
 
 def _parsed(content: bytes) -> tuple[str, list[tuple[str, int, list[Property]]], bytes]:

@@ -44,6 +44,8 @@ raises negative eigenvalues to about 1e-9 mm²/s. In the metric D⁻¹ such voxe
 precede those of the tissue."""
 _NO_LIQUID = 1e-7
 """The eigenvalue in mm²/s below which no diffusion tensor is admissible, whatever the median."""
+_ROUNDED = 1e-3
+"""The share by which an eigenvalue may be below the least admissible one, because files round tensors to float32."""
 
 
 def least_admissible(volume: TensorVolume) -> float:
@@ -76,12 +78,14 @@ def invalid_in(volume: TensorVolume, floor: float | None = None) -> Invalid:
     bad[inside] = ~spd.is_spd(volume.tensors[inside])
     if floor > 0:
         good = inside & ~bad
-        singular[good] = np.linalg.eigvalsh(volume.tensors[good].astype(np.float64))[:, 0] < floor
+        singular[good] = np.linalg.eigvalsh(volume.tensors[good].astype(np.float64))[:, 0] < floor * (1 - _ROUNDED)
     return Invalid(bad | singular, singular, floor)
 
 
 def find_invalid(volume: TensorVolume, floor: float | None = None) -> Bool[np.ndarray, "*shape"]:
     """Return the voxels inside the mask whose tensor is not finite or has an eigenvalue that is ≤ 0 or < `floor`.
+
+    An eigenvalue counts as below `floor` if it is smaller by more than a thousandth, because files round tensors.
 
     If `floor` is None, diffusion tensors must not be nearly singular: their eigenvalues must be at least a hundredth
     of the median mean diffusivity. Tensors are diffusion tensors if their unit is known (`TensorVolume.unit`), or if
@@ -153,7 +157,8 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
             replaces an invalid tensor by the tensor of the nearest valid voxel in space.
         floor: the least admissible eigenvalue, in the tensors' unit. If `floor` is None, `find_invalid` decides which
             tensors are invalid, and the floor of ``"clip"`` is 1 % of the median of the valid tensors' mean
-            eigenvalues.
+            eigenvalues, and at least that of `find_invalid`. The repaired tensors are also valid by the median after
+            the repair, for example when they are read from a file again.
 
     Returns:
         The repaired volume, with a note that summarises the repair. The volume's attribute ``repair`` contains the
@@ -177,12 +182,25 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
         require_number("floor", floor)
     volume = without_background(volume)
     found, inside = invalid_in(volume, floor), volume.inside
+    mended, raised_to = volume, floor
+    while found.bad.any() and not found.bad[inside].all():
+        if method == "clip" and (lost := int((~np.isfinite(volume.tensors[found.bad]).all(axis=(-2, -1))).sum())):
+            raise ValueError(
+                f"repair: {lost} tensors are NaN or infinite and have no eigenvalues to clip. Choose "
+                '"mask" or "nearest"'
+            )
+        mended, raised_to = _mended(volume, found, method, floor)
+        # The repair changes the median of the tensors, and so which tensors are admissible afterwards.
+        needed = 0.0 if floor is not None else least_admissible(mended)
+        if needed <= found.floor:
+            break
+        found = invalid_in(volume, needed)
     bad, least = found.bad, found.floor
     finite = bad & np.isfinite(volume.tensors).all(axis=(-2, -1))
     count, of, where = int(bad.sum()), int(inside.sum()), np.argwhere(bad)
     report: dict[str, Any] = {
         "method": method,
-        "floor": floor,
+        "floor": raised_to,
         "voxels": count,
         "of": of,
         "not_finite": int((bad & ~finite).sum()),
@@ -202,35 +220,41 @@ def repair_tensors(volume: TensorVolume, method: Repair, floor: float | None = N
             f"repair. {why}"
         )
     worst = f" (the worst eigenvalue is {report['worst_eigenvalue']:.3g})" if finite.any() else ""
-    tensors, changed = volume.tensors.copy(), dict[str, Any]()
+    done = {
+        "mask": "the repair leaves out the voxels of invalid tensors",
+        "clip": f"the repair raises eigenvalues of invalid tensors to {raised_to or 0:.3g}",
+        "nearest": "the nearest valid tensor replaces each invalid tensor",
+    }[method]
+    worst += f", the first at voxel {tuple(report['first'][0])}"
+    notes = (*volume.notes, f"repair: {count} of {of} tensors {wrong}{worst}; {done}")
+    return replace(mended, repair=report, notes=notes)
+
+
+def _mended(
+    volume: TensorVolume, found: Invalid, method: Repair, floor: float | None
+) -> tuple[TensorVolume, float | None]:
+    """Return the volume with its invalid tensors repaired, and the floor, which ``"clip"`` chooses if it is None."""
+    bad, inside, tensors, changed = found.bad, volume.inside, volume.tensors.copy(), dict[str, Any]()
     if method == "mask":
-        changed["mask"], done = inside & ~bad, "the repair leaves out the voxels of invalid tensors"
-    elif method == "clip":
-        if report["not_finite"]:
-            raise ValueError(
-                f"repair: {report['not_finite']} tensors are NaN or infinite and have no eigenvalues to clip. Choose "
-                '"mask" or "nearest"'
-            )
+        return volume.with_mask(inside & ~bad), floor
+    if method == "clip":
         if floor is None:
             typical = np.trace(tensors[inside & ~bad], axis1=-2, axis2=-1) / volume.dimension
-            report["floor"] = floor = 0.01 * float(np.median(typical))
+            floor = max(_SINGULAR * float(np.median(typical)), found.floor)
         wrong_ones = tensors[bad].astype(np.float64)
         values, vectors = np.linalg.eigh(wrong_ones + np.swapaxes(wrong_ones, -1, -2))
-        raised = (vectors * np.maximum(values / 2, floor)[:, None, :]) @ np.swapaxes(vectors, -1, -2)
-        tensors[bad], done = raised, f"the repair raises eigenvalues of invalid tensors to {floor:.3g}"
+        tensors[bad] = (vectors * np.maximum(values / 2, floor)[:, None, :]) @ np.swapaxes(vectors, -1, -2)
     else:
         nearest = ndimage.distance_transform_edt(
             bad | ~inside, sampling=volume.spacing, return_distances=False, return_indices=True
         )
-        source, done = tuple(index[bad] for index in nearest), "the nearest valid tensor replaces each invalid tensor"
+        source = tuple(index[bad] for index in nearest)
         tensors[bad] = tensors[source]
         for name in ("covariance", "modes"):
             if (known := getattr(volume, name)) is not None:
                 changed[name] = known.copy()
                 changed[name][bad] = known[source]
-    worst += f", the first at voxel {tuple(report['first'][0])}"
-    notes = (*volume.notes, f"repair: {count} of {of} tensors {wrong}{worst}; {done}")
-    return replace(volume, tensors=tensors, **changed, repair=report, notes=notes)
+    return replace(volume, tensors=tensors, **changed), floor
 
 
 def _why_so_many(volume: TensorVolume, found: Invalid, chosen: bool = False) -> str:

@@ -22,6 +22,8 @@ from hks_jax.io.tensor_order import InvalidByOrder, Matrices, shear_notes, to_vo
 from hks_jax.uncertainty.noise import TensorNoise
 
 AXES = "xyz"
+_SAME_SPACING = 1e-3
+"""The relative tolerance for the spacing of a volume and the voxel sizes of its affine."""
 _ROUNDED_ONE = 0.999
 """The number above which the largest value in a mask is 1 up to the rounding of a scaled image, or more."""
 
@@ -48,7 +50,7 @@ class TensorVolume:
 
     Attributes:
         tensors: (*shape, d, d); values outside the mask are ignored.
-        spacing: the distance between voxels along each axis.
+        spacing: the distance between voxels along each axis; if there is an affine, the lengths of its columns.
         origin: the coordinates of voxel (0, …, 0) on the grid; the affine gives its position in space.
         mask: bool (*shape), or None for all voxels.
         affine: (4, 4), the map from voxel indices to world coordinates, or None. A slice has the affine of a volume one
@@ -71,7 +73,8 @@ class TensorVolume:
             describes noise that is correlated between voxels.
 
     Raises:
-        ValueError: shapes disagree, a spacing is not positive, or a number is not finite.
+        ValueError: shapes disagree, a spacing is not positive, spacing and affine disagree by more than a thousandth,
+            or a number is not finite.
 
     Examples:
         >>> tensors, mask, spacing = hj.examples.phantom((24, 28))
@@ -126,6 +129,12 @@ class TensorVolume:
                 raise ValueError(f"{where}{name}: got {unit!r}; expected {known!r} or nothing. Convert the numbers")
         if self.slice_axis not in ((None,) if d == 3 else (None, 0, 1, 2)):
             raise ValueError(f"{where}slice_axis: got {self.slice_axis} for {d} axes; expected 0, 1 or 2 for a slice")
+        by_affine = None if affine is None else spacing_of(affine, d, self.slice_axis)
+        if by_affine is not None and not np.allclose(self.spacing, by_affine, rtol=_SAME_SPACING, atol=0):
+            raise ValueError(
+                f"{where}spacing: got {self.spacing}, but the affine's voxels have the size {by_affine}; expected the "
+                "same. Leave out the wrong one (an npz without spacing has that of its affine), or correct it"
+            )
         covariance, modes, m = self.covariance, self.modes, d * (d + 1) // 2
         if covariance is not None and covariance.shape != (*shape, m, m):
             raise ValueError(f"{where}covariance: got shape {covariance.shape}; expected {(*shape, m, m)}")
@@ -237,6 +246,14 @@ class TensorVolume:
     def thin_axis(self) -> int:
         """The axis along which a slice is one voxel thick when it is written as a volume; z by default."""
         return 2 if self.slice_axis is None else self.slice_axis
+
+
+def spacing_of(affine: Float[np.ndarray, "4 4"], d: int, slice_axis: int | None) -> tuple[float, ...]:
+    """Return the voxel sizes of an affine along the d axes of a volume, or of a slice perpendicular to `slice_axis`."""
+    sizes = np.linalg.norm(affine[:3, :3], axis=0)
+    if d == 2:
+        sizes = np.delete(sizes, 2 if slice_axis is None else slice_axis)
+    return tuple(sizes.tolist())
 
 
 def placed(name: str, found: Matrices, frame: str, affine: Float[np.ndarray, "4 4"], **known: Any) -> TensorVolume:

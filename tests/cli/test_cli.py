@@ -752,6 +752,7 @@ def test_what_fit_offers_is_what_there_is():
 
 
 FIT_GRID = hj.Grid((14, 13), 1 / 13)
+FIT_AFFINE = np.diag([*FIT_GRID.spacing, 1.0, 1.0])
 FIT_TIMES = np.array([0.02, 0.05, 0.1])
 FIT_ARGUMENTS = ["--parametrisation", "conformal", "--h1", "1e-8"]  # the same ones compile once
 
@@ -873,7 +874,7 @@ def test_an_interrupted_fit_writes_the_best_so_far(conformal, tmp_path, capsys, 
         ([], {"hks": np.nan}, ["target: got 1 of 546 observed values that are NaN", "(2, 3, 4)"]),
         (["--init", "init.npz"], {}, ["--init: got tensors of shape (14, 12)", "the target's shape (14, 13)"]),
         (["--init", "volume.npz"], {}, ["shape (5, 4, 3)", "hks-jax convert volume.npz slice.npz --slice"]),
-        (["--init", "moved.npz"], {"affine": np.eye(4)}, ["--init: the affine displaces", "up to 3 from the target"]),
+        (["--init", "moved.npz"], {"affine": FIT_AFFINE}, ["--init: the affine displaces", "up to 3 from the target"]),
         (["--metric", "inverse"], {}, ["--metric", "--init"]),
         (["--init", "init.nii.gz"], {}, ["--metric: choose"]),
         (["--init", "init.nrrd"], {}, ["--metric: choose"]),
@@ -890,7 +891,7 @@ def test_fit_errors_are_one_line_and_leave_nothing(conformal, tmp_path, capsys, 
     write_target("target.npz", values, **changes)
     np.savez("init.npz", tensors=metric())
     np.savez("volume.npz", tensors=np.broadcast_to(np.eye(3), (5, 4, 3, 3, 3)))
-    moved = np.eye(4) + 3.0 * np.eye(4)[:, [3, 0, 1, 2]] * [0, 0, 0, 1]
+    moved = FIT_AFFINE + 3.0 * np.eye(4)[:, [3, 0, 1, 2]] * [0, 0, 0, 1]
     np.savez("scan.npz", tensors=metric(), length_unit="mm")
     np.savez("moved.npz", tensors=np.tile(np.eye(2), (*FIT_GRID.shape, 1, 1)), affine=moved)
     before = sorted(tmp_path.iterdir())

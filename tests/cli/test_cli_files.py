@@ -33,7 +33,9 @@ def disc():
 @pytest.fixture
 def tensors(tmp_path):
     field = np.where(disc()[..., None, None], D * (1 + 0.1 * np.indices(SHAPE)[0][..., None, None]), 0)
-    return save_tensors(tmp_path / "t.nii.gz", TensorVolume(field, (2.0, 2.0, 3.0), (0.0,) * 3, affine=AFFINE))
+    return save_tensors(
+        tmp_path / "t.nii.gz", TensorVolume(field, (2.0, 2.0, 3.0), (0.0,) * 3, affine=AFFINE, length_unit="mm")
+    )
 
 
 @pytest.fixture
@@ -337,6 +339,53 @@ def test_signature_of_a_surface_without_some_vertices(tmp_path, capsys):
         assert text in capsys.readouterr().err
     np.save(tmp_path / "labels.npy", 7 + (np.asarray(sphere.vertices)[:, 0] > 0))
     assert main(["explore", str(tmp_path / "out"), "--labels", str(tmp_path / "labels.npy"), "-q"]) == 0
+
+
+@pytest.mark.parametrize("suffix", ["label", "npy"])
+def test_a_mask_has_the_numbering_of_the_file_before_cleaning(tmp_path, capsys, suffix):
+    """A vertex without a face is removed first, so that all others have another number than in the file."""
+    sphere = hj.examples.sphere_mesh(3)
+    vertices = np.concatenate([[[5.0, 5, 5]], sphere.vertices])
+    inside = vertices[:, 2] > -0.4
+    path, mask, out = tmp_path / "s.off", tmp_path / f"inside.{suffix}", tmp_path / "out"
+    rows = [" ".join(map(repr, row.tolist())) for row in vertices] + [f"3 {a} {b} {c}" for a, b, c in sphere.faces + 1]
+    path.write_text("\n".join([f"OFF\n{len(vertices)} {len(sphere.faces)} 0", *rows]) + "\n")
+    if suffix == "npy":
+        np.save(mask, inside)
+    else:
+        lines = ["#!ascii label", str(inside.sum()), *(f"{number} 0 0 0 0" for number in np.flatnonzero(inside))]
+        mask.write_text("\n".join(lines) + "\n")
+    cap = hj.SurfaceMesh(sphere.vertices, sphere.faces, mask=inside[1:])
+    expected = hj.hks(hj.eigenpairs(cap, 6), [0.5], "flat")
+    more = ["-o", str(out), "-k", "6", "--times", "0.5", "-q", "--inside", str(mask)]
+    assert main(["hks", str(path), *more, "--clean"]) == 0
+    with np.load(out / "hks.npz") as found:
+        np.testing.assert_allclose(found["hks"], expected, rtol=1e-4)
+    np.save(tmp_path / "labels.npy", np.ones(len(vertices), int))  # of the vertices before
+    assert main(["explore", str(out), "--labels", str(tmp_path / "labels.npy"), "-q"]) == 2
+    assert "(93,); expected (92,), one for each vertex of the result. Cleaning" in capsys.readouterr().err
+
+
+def test_a_mask_excludes_bad_triangles_of_a_file(tmp_path):
+    """Outside the mask, a vertex is NaN and a triangle is degenerate; no cleaning is needed."""
+    sphere = hj.examples.sphere_mesh(3)
+    vertices, faces = np.array(sphere.vertices), np.array(sphere.faces)
+    inside = vertices[:, 2] > -0.4
+    low = np.argsort(vertices[:, 2])
+    vertices[low[0]] = np.nan
+    faces = np.concatenate([faces, [[low[1], low[1], low[2]]]])
+    np.save(tmp_path / "inside.npy", inside)
+    rows = [" ".join(map(repr, row.tolist())) for row in vertices] + [f"3 {a} {b} {c}" for a, b, c in faces]
+    path, out = tmp_path / "s.off", tmp_path / "out"
+    path.write_text("\n".join([f"OFF\n{len(vertices)} {len(faces)} 0", *rows]) + "\n")
+    with pytest.raises(ValueError, match="vertices: 1 are NaN"):
+        hj.io.read_mesh(path)
+    cap = hj.SurfaceMesh(sphere.vertices, sphere.faces, mask=inside)
+    np.testing.assert_array_equal(hj.io.read_mesh(path, mask=inside).faces, cap.faces)
+    more = ["-o", str(out), "-k", "6", "--times", "0.5", "-q", "--inside", str(tmp_path / "inside.npy")]
+    assert main(["hks", str(path), *more]) == 0
+    with np.load(out / "hks.npz") as found:
+        np.testing.assert_allclose(found["hks"], hj.hks(hj.eigenpairs(cap, 6), [0.5], "flat"), rtol=1e-4)
 
 
 # ---------------------------------------------------------------------------------------------------- convert

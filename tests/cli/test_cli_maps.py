@@ -23,7 +23,11 @@ MASK = np.hypot(*(np.indices(SHAPE)[:2] - 3.5)) < 4.2
 @pytest.fixture
 def tensors(tmp_path):
     values = np.where(MASK[..., None, None], D * (1 + 0.1 * np.indices(SHAPE)[0][..., None, None]), 0)
-    return str(save_tensors(tmp_path / "t.nii.gz", TensorVolume(values, (2.0, 2.0, 3.0), (0.0,) * 3, affine=AFFINE)))
+    return str(
+        save_tensors(
+            tmp_path / "t.nii.gz", TensorVolume(values, (2.0, 2.0, 3.0), (0.0,) * 3, affine=AFFINE, length_unit="mm")
+        )
+    )
 
 
 @pytest.fixture

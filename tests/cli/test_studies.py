@@ -56,7 +56,7 @@ def tensors(scale=1.0):
 
 
 def volume(scale=1.0):
-    return TensorVolume(tensors(scale), (2.0, 2.0, 3.0), (0.0,) * 3, affine=AFFINE)
+    return TensorVolume(tensors(scale), (2.0, 2.0, 3.0), (0.0,) * 3, affine=AFFINE, length_unit="mm")
 
 
 def table(path):
@@ -715,7 +715,9 @@ def test_a_study_has_errors_of_regions_and_computes_again_what_had_other_noise(s
 
     def scan_again():
         other = tensors() * (1 + 0.04 * rng.standard_normal((*SHAPE, 1, 1)))
-        save_tensors(study / "second.nii.gz", TensorVolume(other, (2.0, 2.0, 3.0), (0.0,) * 3, affine=AFFINE))
+        save_tensors(
+            study / "second.nii.gz", TensorVolume(other, (2.0, 2.0, 3.0), (0.0,) * 3, affine=AFFINE, length_unit="mm")
+        )
 
     scan_again()
     words = command(study, "out", "--times", "3e3", "6e3", "--noise", "0.01", "--draws", "8", "--save-pairs")

@@ -248,3 +248,68 @@ def test_cleaning_says_all_that_it_did_on_the_command_line(tmp_path, capsys):
     np.savez(tmp_path / "t.npz", tensors=np.broadcast_to(np.eye(2), (5, 5, 2, 2)))
     assert main(["hks", str(tmp_path / "t.npz"), "-o", str(tmp_path / "o"), "--clean"]) == 2
     assert "--clean: this option is for meshes" in capsys.readouterr().err
+
+
+# ---------------------------------------------------------------------------------------------- what only touches
+
+
+def two_spheres(n):
+    """Two unit spheres that share the vertex of the largest z of the first; also the number of this vertex."""
+    sphere = hj.examples.sphere_mesh(n)
+    vertices = np.asarray(sphere.vertices, np.float64)
+    top = int(np.argmax(vertices[:, 2]))
+    turned = 2 * vertices[top] - vertices  # reflected in the vertex
+    numbers = len(vertices) + np.arange(len(vertices)) - (np.arange(len(vertices)) > top)
+    numbers[top] = top
+    return (
+        np.concatenate([vertices, np.delete(turned, top, axis=0)]),
+        np.concatenate([sphere.faces, numbers[sphere.faces]]),
+        top,
+    )
+
+
+def test_parts_that_touch_only_at_a_vertex_are_named():
+    vertices, faces, top = two_spheres(3)
+    with pytest.warns(
+        hj.AccuracyWarning, match=rf"faces: at 1 vertices, parts .* sharing an edge .* vertex {top}, with"
+    ):
+        hj.SurfaceMesh(vertices, faces)
+    pair = np.concatenate([TETRAHEDRON, -TETRAHEDRON[1:]])  # two tetrahedra share a vertex, and then an edge
+    with pytest.warns(hj.AccuracyWarning, match="cells: at 1 vertices, parts .* sharing a triangle .* vertex 0, with"):
+        hj.TetMesh(pair, [[0, 1, 2, 3], [0, 5, 4, 6]])
+    pair = np.concatenate([TETRAHEDRON, [[0.0, -1, 0], [0, 0, -1]]])
+    with pytest.warns(hj.AccuracyWarning, match="cells: at 2 vertices"):
+        hj.TetMesh(pair, [[0, 1, 2, 3], [0, 1, 4, 5]])
+
+
+def test_sound_meshes_with_and_without_boundary_have_no_such_vertices():
+    vertices, faces = square(8)
+    i, j = np.divmod(np.tile(np.arange(64), 2), 8)
+    keep = (np.abs(i - 3.5) > 2) | (np.abs(j - 3.5) > 2)  # a square with a square hole
+    numbers, holed = np.unique(faces[keep], return_inverse=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for mesh in (
+            hj.SurfaceMesh(vertices[numbers], holed.reshape(-1, 3)),
+            hj.examples.sphere_mesh(4),
+            hj.examples.bumpy_torus_mesh(12),
+            hj.examples.ball_mesh(3),
+            hj.SurfaceMesh(vertices, faces, mask=keep),
+        ):
+            assert not mesh.triangulation.pinched_vertices.size
+
+
+def test_cleaning_is_no_remedy_for_parts_that_touch_at_a_point(tmp_path):
+    vertices, faces, top = two_spheres(3)
+    half = len(faces) // 2
+    apart = np.concatenate([vertices, vertices[top : top + 1]])
+    separate = np.concatenate([faces[:half], np.where(faces[half:] == top, len(vertices), faces[half:])])
+    path = save_off(tmp_path / "m.off", apart, separate)
+    with pytest.raises(ValueError, match=r"2 pieces that touch; expected 1, .* would leave 1 at which") as told:
+        read_mesh(path)
+    assert "clean=True" not in str(told.value)
+    with (
+        pytest.warns(UserWarning, match="1 vertices merged"),
+        pytest.warns(hj.AccuracyWarning, match="parts of the mesh touch"),
+    ):
+        read_mesh(path, clean=True)

@@ -106,3 +106,31 @@ def test_bad_triangles_and_unused_vertices_are_left_out():
     ambiguous = hj.examples.bumpy_torus_mesh(6)
     with pytest.raises(ValueError, match=r"vertices and as many .* ambiguous"):
         hj.SurfaceMesh(ambiguous.vertices, ambiguous.faces[:36], mask=np.arange(36) < 30)
+
+
+def with_as_many_faces_inside_as_vertices():
+    """A sphere of 42 vertices and 80 faces, with a mask of 42 faces."""
+    sphere = hj.examples.sphere_mesh(2)
+    inside = np.arange(80) < 42
+    return np.asarray(sphere.vertices), sphere.faces, inside
+
+
+def test_fields_of_all_cells_are_not_nodal_although_as_many_cells_as_vertices_are_inside(rng):
+    vertices, faces, inside = with_as_many_faces_inside_as_vertices()
+    mesh, of_faces = hj.SurfaceMesh(vertices, faces, mask=inside), rng.uniform(1, 2, 80)
+    corners = vertices[faces[inside]]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    nodal = rng.uniform(1, 2, 42)
+    for density, expected in ((of_faces, areas @ of_faces[inside]), (nodal, areas @ nodal[faces[inside]].mean(axis=1))):
+        mass = hj.assemble(mesh, density=density).mass.to_dense()
+        assert float(mass.sum()) == pytest.approx(float(expected))  # ∫ρ
+
+
+def test_tensors_of_all_cells_are_not_nodal_although_as_many_cells_as_vertices_are_inside(rng):
+    vertices, faces, inside = with_as_many_faces_inside_as_vertices()
+    scales = rng.uniform(1, 2, 80)
+    mesh = hj.SurfaceMesh.from_tensors(vertices, faces, scales[:, None, None] * np.eye(3), "tensor", mask=inside)
+    flat = hj.SurfaceMesh(vertices, faces, mask=inside).metric
+    np.testing.assert_allclose(mesh.metric, scales[inside, None, None] * flat, rtol=1e-6)
+    with pytest.raises(ValueError, match="as many faces as vertices, 42"):  # nodal, or of the faces inside
+        hj.SurfaceMesh.from_tensors(vertices, faces, np.broadcast_to(np.eye(3), (42, 3, 3)), "tensor", mask=inside)

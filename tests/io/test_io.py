@@ -643,3 +643,20 @@ def test_results_and_volumes_take_lists_and_check_shapes(tmp_path):
             hj.io.TensorVolume(volume.tensors, (1, 1), (0, 0), modes=np.ones((4, 3, 3)))
         mask = hj.io.read_tensors(hj.io.save_tensors(tmp_path / "t.npz", volume), mask=[[1, 1, 0]] * 4).mask
         assert mask.sum() == 8
+
+
+@pytest.mark.parametrize("axis", [None, 0, 1, 2])
+def test_an_affine_gives_the_spacing_that_an_npz_lacks(tmp_path, axis):
+    c, s = np.cos(0.3), np.sin(0.3)
+    affine = np.diag([1.0, 1, 1, 1])
+    affine[:3, :3] = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.diag([1.5, 2.0, 3.0])
+    d, sizes = (3, [1.5, 2.0, 3.0]) if axis is None else (2, np.delete([1.5, 2.0, 3.0], axis))
+    arrays = {"tensors": np.broadcast_to(np.eye(d), (*(5,) * d, d, d)), "affine": affine}
+    arrays |= {} if axis is None else {"slice_axis": axis}
+    np.savez(tmp_path / "t.npz", **arrays)
+    np.testing.assert_allclose(hj.io.read_tensors(tmp_path / "t.npz").spacing, sizes)
+    np.savez(tmp_path / "t.npz", **arrays, spacing=np.multiply(sizes, 1.01))
+    with pytest.raises(ValueError, match=r"t\.npz: spacing: got .*, but the affine's voxels have the size \("):
+        hj.io.read_tensors(tmp_path / "t.npz")
+    np.savez(tmp_path / "t.npz", **arrays, spacing=np.multiply(sizes, 1 + 1e-6))  # rounded
+    np.testing.assert_allclose(hj.io.read_tensors(tmp_path / "t.npz").spacing, sizes, rtol=1e-5)

@@ -285,3 +285,18 @@ def test_a_series_has_a_file_for_each_time(tmp_path):
     for given in ({}, {"times": [1.0]}):
         with pytest.raises(ValueError, match=r"extra: got [01] times for values of shape \(2, 42\)"):
             save(tmp_path / "v.pvd", values, sphere, extra=given)
+
+
+@pytest.mark.parametrize("suffix", ["ply", "vtk", "vtu", "msh"])
+def test_a_mesh_with_a_mask_is_read_again_with_the_mask(tmp_path, suffix):
+    sphere = hj.examples.sphere_mesh(3)
+    vertices = np.array(sphere.vertices, np.float64)
+    inside = vertices[:, 2] > -0.4
+    vertices[np.argmin(vertices[:, 2])] = np.nan
+    cap = hj.SurfaceMesh(vertices, sphere.faces, mask=inside)
+    path = save(tmp_path / f"cap.{suffix}", np.arange(92.0), cap)
+    read = read_mesh(path, mask=inside)
+    np.testing.assert_allclose(read.vertices, vertices, rtol=1e-6)
+    np.testing.assert_array_equal(read.faces, cap.faces)
+    with pytest.raises(ValueError, match=r"^mask: got shape \(7,\)"):
+        read_mesh(path, mask=inside[:7])

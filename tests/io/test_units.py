@@ -262,3 +262,20 @@ def test_a_unit_that_is_asked_for_overrides_the_sidecar(tmp_path):
     unknown = read_tensors(tree.bep16(tmp_path, "02", unit="10^-3 mm^2/s"))
     assert unknown.unit == ""
     assert any("the Units '10^-3 mm^2/s' of the sidecar are ignored" in note for note in unknown.notes)
+
+
+@pytest.mark.parametrize("name", ["t.nii.gz", "t.nrrd"])
+def test_an_unknown_unit_of_length_stays_unknown(tmp_path, name):
+    """Tensors of NumPy's files, such as a metric, have no unit; with lengths in mm, another unit would be suggested."""
+    if name.endswith(".nrrd"):
+        pytest.importorskip("nrrd")
+    affine = np.diag([2.0, 2.0, 2.0, 1.0])
+    volume = TensorVolume(np.broadcast_to(1e3 * D, (*SHAPE, 3, 3)), (2.0,) * 3, (0.0,) * 3, affine=affine)
+    read = read_tensors(save_tensors(tmp_path / name, volume))
+    assert (read.length_unit, questions(read)) == ("", ())
+    known = read_tensors(save_tensors(tmp_path / name, replace(volume, length_unit="mm")))
+    assert known.length_unit == "mm"
+    assert questions(known)[0].startswith("Wrong unit?")
+    if name.endswith(".gz"):
+        save(tmp_path / name, np.ones(SHAPE), volume)
+        assert nib.load(tmp_path / name).header.get_xyzt_units()[0] == "unknown"

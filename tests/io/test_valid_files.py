@@ -402,3 +402,24 @@ def test_vtu_of_several_pieces(tmp_path, form):
         path.write_bytes(content.replace(b"header_type", b'compressor="vtkLZ4DataCompressor" header_type'))
         with pytest.raises(ValueError, match=r"m\.vtu: the data are compressed by vtkLZ4.* with zlib compression"):
             hj.io.read_mesh(path)
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ("x y z|list uchar int tristrips", "vertex: x, y, z; face: list tristrips; expected"),
+        ("x y|list uchar int vertex_indices", "vertex: x, y; face: list vertex_indices; expected"),
+        ("x y z|int vertex_indices", "vertex: x, y, z; face: vertex_indices; expected"),
+        ("x y z", "vertex: x, y, z; face: none; expected"),
+    ],
+)
+def test_an_intact_ply_that_is_no_mesh_of_polygons_is_not_called_damaged(tmp_path, header, words):
+    points, _, faces = header.partition("|")
+    lines = ["ply", "format ascii 1.0", "element vertex 3", *(f"property float {name}" for name in points.split())]
+    lines += ["element face 1", f"property {faces}"] if faces else []
+    rows = ["0 " * len(points.split())] * 3
+    path = tmp_path / "m.ply"
+    path.write_text("\n".join([*lines, "end_header", *rows, *(["3 0 1 2"] if faces else [])]) + "\n")
+    with pytest.raises(ValueError, match=words) as told:
+        hj.io.read_mesh(path)
+    assert "damaged" not in str(told.value)
