@@ -104,11 +104,12 @@ def signed_measure(
         return measure, np.abs(measure) > _FLAT * longest ** (len(edges[0]) / 2)
 
 
-def check_places(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulation) -> None:
+def check_places(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulation, whole: bool = True) -> None:
     """Raise ValueError for vertices that are not finite, and for degenerate, inverted or overlapping simplices.
 
     Two triangles overlap if they have the same vertices. Warn if three triangles of a surface share an edge, if an edge
-    of a surface passes through a vertex, or if parts of a mesh touch only at vertices.
+    of a surface passes through a vertex, or if parts of a ``whole`` mesh touch only at vertices, as the ragged rim of a
+    mask may.
     """
     infinite = triangulation.used & ~np.isfinite(vertices).all(axis=1)
     if infinite.any():
@@ -132,7 +133,7 @@ def check_places(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulatio
                 f"faces: {crowded.size} edges belong to three triangles or more (the first has the vertices {edge}): "
                 "heat flows into all branches of the surface there. To avoid this, keep at most two triangles per edge"
             )
-        if not _warn_of_hanging(vertices, triangulation):  # parts also touch at the ends of a crack
+        if not _warn_of_hanging(vertices, triangulation) and whole:  # parts also touch at the ends of a crack
             _warn_of_pinched(triangulation)
         return
     inverted = measure < 0
@@ -150,7 +151,8 @@ def check_places(vertices: Float[np.ndarray, "V 3"], triangulation: Triangulatio
             f"cells: {len(overlaps)} pairs of tetrahedra overlap, as they lie on one side of a common triangle (the "
             f"first pair is cells {a} and {b}); remove duplicates, or move the vertices of a folded mesh apart"
         )
-    _warn_of_pinched(triangulation)
+    if whole:
+        _warn_of_pinched(triangulation)
 
 
 def _warn_of_pinched(triangulation: Triangulation) -> None:

@@ -51,7 +51,7 @@ class SimplicialMesh(eqx.Module):
         self.vertices, self.operator = positions, "laplace-beltrami"
         self.triangulation = triangulation = Triangulation(self.restrict(cells), len(positions))
         if not is_traced(positions):
-            check_places(np.asarray(positions, np.float64), triangulation)
+            check_places(np.asarray(positions, np.float64), triangulation, whole=mask is None)
         self._metric = None if metric is None else _checked_metric(self.restrict(metric), triangulation)
         if metric is None and not is_traced(positions):
             check_metric(np.asarray(self.metric), triangulation.cells)
@@ -107,8 +107,9 @@ class SimplicialMesh(eqx.Module):
         edges, triangulation = mesh._edges, mesh.triangulation
         # The place is known from the shape before cells are removed: afterwards there may be as many as vertices.
         all_cells = len(triangulation.cells) if mesh._mask is None else mesh._mask.value.size
-        at_vertices = _place(np.shape(tensors), triangulation, at, all_cells) == "vertices"
-        array = real_array("tensors", tensors if at_vertices else mesh.restrict(tensors))
+        array = real_array("tensors", tensors)
+        at_vertices = _place(array.shape, triangulation, at, all_cells) == "vertices"
+        array = array if at_vertices else mesh.restrict(array)
         if not is_traced((array, edges)):
             _check_tensors(np.asarray(array), np.asarray(edges), triangulation, at_vertices)
         corners = triangulation.cells if at_vertices else np.arange(len(array))[:, None]

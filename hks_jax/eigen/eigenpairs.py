@@ -242,7 +242,7 @@ class Eigenpairs(ABC):
         cut = int(cut_multiplet)
         sentences, last = [], values[kept - 1]
         lost = bad & (np.arange(values.size) >= self.n_null) & (np.abs(values) <= _ZERO * abs(last))
-        given = isinstance(self.space, MatrixSpace)
+        given = any(isinstance(pencil.space, MatrixSpace) for pencil in self._pencils)
         if given and self.null_space_known and lost.any():
             sentences.append(
                 f"K has {int(lost.sum())} null vectors beyond the {self.n_null} given: expected a basis of its whole "
