@@ -150,6 +150,9 @@ def result_of(solved: Solved, progress: Progress) -> Result:
         arrays["density"] = np.asarray(pairs.pencil.density)
     result = Result(domain.place, values, np.asarray(times), np.asarray(pairs.eigenvalues), report, arrays)
     rows = report["times"]
+    for row in rows:  # values without eigenpairs lack no eigenpair
+        if "method" in origin and row["t"] not in origin["method"]["eigenpairs"]:
+            row |= {"truncation": None, "truncation_worst_node": None}
     for name, column in (("length", result.lengths), ("free_of_rim", free)):
         for row, value in zip(rows, [None] * len(rows) if column is None else column.tolist(), strict=True):
             row[name] = value

@@ -43,6 +43,7 @@ from hks_jax.io.formats import WRITTEN
 from hks_jax.io.json_files import write_json
 from hks_jax.io.mesh import WRITTEN as MESHES_WRITTEN
 from hks_jax.io.mesh import is_surface
+from hks_jax.io.nifti import REPETITION_TIME, repetition_time
 from hks_jax.io.tables import write_table
 from hks_jax.signatures.modes import lengths_of
 
@@ -121,7 +122,7 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
         _tabulate(folder / "modes.tsv", known)
         write_json(folder / "modes.json", _sidecar(domain, unit, known))
         if maps is not None:
-            _write(folder, "reconstruction", projected, domain, {})
+            _write(folder, "reconstruction", projected, domain, repetition_time(args.map) if len(maps) > 1 else {})
             _tabulate(folder / "energies.tsv", known | means)
             _tabulate(folder / "coefficients.tsv", {f"map_{i + 1}": column for i, column in enumerate(coefficients)})
     return done
@@ -163,7 +164,7 @@ def _write(folder: Path, name: str, values: np.ndarray, domain: OfVolume | OfMes
     """Write modes or maps (m, *shape) as .npz and as images."""
     save(folder / f"{name}.npz", values, domain.place, name=name, extra=extra)
     for suffix in filter(None, domain.images):
-        also = {} if suffix.startswith(".nii") else extra
+        also = {n: array for n, array in extra.items() if n == REPETITION_TIME or not suffix.startswith(".nii")}
         stored = values.astype(np.float32)
         save(folder / f"{name}{suffix}", stored, domain.place, name=name, extra=also, provenance=domain.origin)
 

@@ -16,7 +16,7 @@ from hks_jax.domain.components import label_nodes
 from hks_jax.domain.tensor_checks import MetricChoice, OperatorChoice
 from hks_jax.io import TensorVolume, erode, fit_dwi, positive_tensors, read_mask, read_tensors, repair_tensors
 from hks_jax.io.formats import format_of
-from hks_jax.io.nifti import is_nifti, siblings, sidecar_of
+from hks_jax.io.nifti import described_by, is_nifti, siblings, sidecar_of
 from hks_jax.io.plausibility import reviewed
 from hks_jax.io.repair import find_background, require_valid, without_background
 from hks_jax.io.tensor_order import Order
@@ -79,7 +79,8 @@ class Reading:
         images: list[Any] = [self.file, *self.others]
         if not self.others and self.bval is None:
             images = list(siblings(self.file))
-        sidecar = sidecar_of(images[0]) if self.bval is None and is_nifti(images[0]) else None
+        named = described_by([str(image) for image in images])
+        sidecar = sidecar_of(named) if self.bval is None and is_nifti(named) else None
         sidecars = [] if sidecar is None or not sidecar.is_file() else [sidecar]
         given = {"file": images, "sidecar": sidecars, "mask": [self.mask], "bval": [self.bval], "bvec": [self.bvec]}
         inputs = {role: [str(path) for path in paths if path is not None] for role, paths in given.items()}
@@ -186,6 +187,8 @@ def _without_filling(volume: TensorVolume, reading: Reading, progress: Progress)
 
     Zero tensors are always background, except with ``--positive``: zero is a valid stress.
     """
+    if volume.mask is not None and reading.background is not None:
+        progress.note(f"--background {reading.background} has no effect, because the volume has a mask")
     if reading.positive is None or reading.background == "outside":
         volume = without_background(volume)
     found = None if reading.background == "inside" else find_background(volume)

@@ -41,6 +41,7 @@ from hks_jax.io import read_maps, save
 from hks_jax.io.cortex import MAPS
 from hks_jax.io.formats import WRITTEN
 from hks_jax.io.mesh import WRITTEN as MESHES_WRITTEN
+from hks_jax.io.nifti import repetition_time
 from hks_jax.spectrum_free.smoothing import smooth
 
 USAGE = "FILE --fwhm LENGTH -o OUT"
@@ -123,12 +124,12 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
     stale = [args.output / f"smoothed{suffix}" for suffix in (MAPS, *WRITTEN, *MESHES_WRITTEN)]
     draw: Any = _draw if args.mesh is None else _draw_mesh
     pictures = {"smoothed.png": partial(draw, domain, args, maps[0], smoothed[0])}
-    record = {**report["settings"], **domain.origin}
+    record, step = {**report["settings"], **domain.origin}, repetition_time(args.file) if len(maps) > 1 else {}
     with writing(args.output, report, progress, lambda: stale, pictures) as (folder, done):
         values = smoothed if len(smoothed) > 1 else smoothed[0]
         for suffix in filter(None, (".npz", *domain.images)):
             stored = values if suffix == ".npz" else values.astype(np.float32)
-            save(folder / f"smoothed{suffix}", stored, place, name="smoothed", provenance=record)
+            save(folder / f"smoothed{suffix}", stored, place, name="smoothed", extra=step, provenance=record)
     return done
 
 

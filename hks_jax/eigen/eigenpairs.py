@@ -33,7 +33,10 @@ _SAMPLE = 20_000
 class RESULTS(eqx.Enumeration):
     """The outcome of a computation of eigenpairs: a traceable code like those of lineax and optimistix."""
 
-    successful = "All eigenpairs converged, and the solver confirmed that it missed none."
+    successful = (
+        "All eigenpairs converged, and a solver with a certificate (`.complete_below` is not NaN) confirmed that it "
+        "missed none."
+    )
     not_finite = "The matrices are not finite: tensors are NaN, infinite or not positive definite."
     unconverged = (
         "Some eigenpairs did not converge (see `.converged`), or were not found and are NaN. Use float64, fewer pairs, "
@@ -78,8 +81,9 @@ class Eigenpairs(ABC):
         next_eigenvalue: the first eigenvalue that is not kept; infinite if it does not exist. Derivatives treat
             `next_eigenvalue` as a constant.
         complete_below: the bound below which the solver certifies that it missed no eigenvalue, by Sylvester's law of
-            inertia or because it computed all eigenvalues. `complete_below` is NaN without a certificate. Derivatives
-            treat `complete_below` as a constant.
+            inertia or because it computed all eigenvalues; NaN without a certificate. The solver may have computed more
+            than k pairs: no eigenvalue below both `complete_below` and `next_eigenvalue` is missing among the k.
+            Derivatives treat `complete_below` as a constant.
         spectral_origin: the reference point of relative errors: 0 if K ⪰ 0 is known, otherwise the lowest eigenvalue.
         multiplet_tolerance: the gap, relative to the distance from `spectral_origin`, below which neighbouring
             eigenvalues count as equal. If the null space is unknown, gaps at the level of rounding count as zero too.

@@ -14,14 +14,15 @@ from hks_jax.io.volume import Format, TensorVolume, describe_tensors, mask_in_fi
 from hks_jax.storage import load_npy, load_npz, write_npz
 
 
-def _read_image(name: str) -> tuple[np.ndarray, None, str]:
-    """Return the array of an npy or the array ``mask`` of an npz, None for the affine, and no unit (the empty text)."""
+def _read_image(name: str) -> tuple[np.ndarray, np.ndarray | None, str]:
+    """Return the array of an npy or the array ``mask`` of an npz, its affine if it is a volume's, and no unit ("")."""
     if name.lower().endswith(".npy"):
         return load_npy(name), None, ""
     arrays = load_npz(name)
     if "mask" not in arrays:
         raise ValueError(f"{name}: got the arrays {', '.join(sorted(arrays)) or 'none'}; expected an array 'mask'")
-    return arrays["mask"], None, ""
+    affine = arrays.get("affine") if arrays["mask"].ndim == 3 else None  # a slice's affine is not that of its volume
+    return arrays["mask"], None if affine is None else _real(f"{name}: affine", affine), ""
 
 
 def _read_tensors(

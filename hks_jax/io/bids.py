@@ -9,9 +9,10 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from hks_jax.io.json_files import read_json
+from hks_jax.io.nifti import sidecar_of
 from hks_jax.io.tables import read_table
 from hks_jax.io.tensor_order import Order
 
@@ -274,6 +275,24 @@ class Dataset:
             raise ValueError(_ambiguous(f"files *_{suffix}", files[:2], option))
         return files[0].path
 
+    def masks(self, participant: str) -> list[Path]:
+        """Return all masks of a participant beside images of diffusion."""
+        files = [file for file in self.files(participant) if file.path.parent.name == "dwi"]
+        return [f.path for f in files if f.name.extension in _IMAGES and re.fullmatch("(.*_)?mask", f.name.suffix)]
+
+    def inherited(self, file: File) -> dict[str, Any]:
+        """Return the metadata of an image, if BIDS's inheritance adds to its sidecar; otherwise an empty dictionary.
+
+        A JSON file of fewer entities, beside the image or in a folder above, describes the image too; a nearer file
+        replaces entries of the others.
+        """
+        chain = [path for folder in self._above(file) for path in reversed(_applying(file, folder, "json"))]
+        merged = dict[str, Any]()
+        for path in reversed(chain):
+            content = read_json(path)
+            merged |= content if isinstance(content, dict) else {}
+        return merged if any(path != sidecar_of(file.path) for path in chain) else {}
+
     def covariates(self) -> dict[str, dict[str, str]]:
         """Return the rows of participants.tsv without their first column, by participant (``sub-01``)."""
         tables = [root / "participants.tsv" for root in (self.folder, *self.roots)]
@@ -282,18 +301,23 @@ class Dataset:
 
     def _table(self, file: File, extension: str) -> Path | None:
         """Return the b-values or directions of images: of the same name, or inherited from a folder above."""
-        for folder in (file.path.parent, *file.path.parent.parents):
-            names = {path: parse_name(path.name) for path in sorted(folder.glob(f"*.{extension}"))}
-            fitting = [
-                path
-                for path, name in names.items()
-                if name.suffix == file.name.suffix and name.entities.items() <= file.name.entities.items()
-            ]
-            if fitting:
-                return max(fitting, key=lambda path: len(names[path].entities))
-            if folder == file.root:
-                break
-        return None
+        return next((found[-1] for folder in self._above(file) if (found := _applying(file, folder, extension))), None)
+
+    def _above(self, file: File) -> list[Path]:
+        """Return the folders from that of a file up to the root of its derivative."""
+        folders = [file.path.parent, *file.path.parent.parents]
+        return folders[: folders.index(file.root) + 1]
+
+
+def _applying(file: File, folder: Path, extension: str) -> list[Path]:
+    """Return the files of a folder that describe an image by BIDS's inheritance; the last has the most entities."""
+    names = {path: parse_name(path.name) for path in sorted(folder.glob(f"*.{extension}"))}
+    fitting = [
+        path
+        for path, name in names.items()
+        if name.suffix == file.name.suffix and name.entities.items() <= file.name.entities.items()
+    ]
+    return sorted(fitting, key=lambda path: len(names[path].entities))
 
 
 def _with_derivatives(folder: Path) -> list[Path]:

@@ -141,6 +141,10 @@ def fit_dwi(
         )
     if b.min() < 0:
         raise ValueError(f"{os.fspath(bval)}: got the b-value {b.min():g}; expected numbers from 0")
+    if unit not in (None, *UNITS):
+        raise ValueError(f"unit: got {unit!r}; expected one of {', '.join(UNITS)}")
+    if b_max is not None:
+        require_number("b_max", b_max, inclusive=True)
     if question := b_value_question(float(b.max()), unit or "mm2/s"):
         raise ValueError(f"{os.fspath(bval)}: {question}")
     b = b / UNITS[unit or "mm2/s"]
@@ -387,6 +391,8 @@ def _inside(
         notes.append(f"no mask given: DIPY's median_otsu finds {int(inside.sum())} voxels in the unweighted images")
     else:
         inside = mask_on(signal.shape[:3], affine, mask)
+        if not inside.any():
+            raise ValueError("mask: got a mask without voxels; expected at least one voxel inside")
     present = measured[inside]
     if empty := images[~present.any(axis=0)].tolist():
         raise ValueError(

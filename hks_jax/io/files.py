@@ -115,7 +115,7 @@ def read_tensors(
         volume = reader.read_tensors(name, order, frame, **{option: given[option] for option in reader.options})
         if not name.lower().endswith(".nhdr"):  # the digest of a detached header would not identify the data
             volume = replace(volume, digest=digest(name))
-    volume = nifti.with_units(volume, paths[0], unit)
+    volume = nifti.with_units(volume, nifti.described_by(paths), unit)
     if mask is not None:
         volume = volume.with_mask(mask_on(volume.shape, volume.affine, mask))
     return volume if repair is None else repair_tensors(volume, repair)
@@ -134,7 +134,8 @@ def save(
 
     - ``.nii``, ``.nii.gz``: an image with the volume's affine and times along the fourth axis. A slice is written as
       an image one voxel thick at its position in space. NaN outside the mask is kept. Times in `extra` are written to
-      NAME.json beside the image as ``Times``, following BIDS, with the ``OrientationEncoding`` of scalars.
+      NAME.json beside the image as ``Times``, following BIDS, with the ``OrientationEncoding`` of scalars. A series has
+      the ``RepetitionTime`` in `extra`, in s, as its fourth voxel size.
     - ``.nrrd``: the same image with times along the last axis, and `extra` as text in the header.
     - ``.vti``: point data with ``mask`` and one array per time, whose name contains the time; field data with `extra`.
     - ``.npz``: the values as the array `name`, and the arrays in `extra`. For a volume or slice, the npz also contains

@@ -100,7 +100,7 @@ def read_labels(path: str | os.PathLike[str], on: TensorVolume | SimplicialMesh)
         raise ValueError(f"{name}: got labels of shape {values.shape}; expected {expected}")
     if not np.isfinite(values).all() or not np.array_equal(values, np.rint(values)):
         raise ValueError(f"{name}: got fractional numbers; expected integer labels. Resample by the nearest neighbour")
-    return np.asarray(values).astype(np.int32)
+    return np.asarray(values).astype(np.int64)
 
 
 def read_names(path: str | os.PathLike[str]) -> dict[int, str]:

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.io.json_files import write_json
 from hks_jax.io.plausibility import undeclared_frame
 from hks_jax.io.repair import require_symmetric
-from hks_jax.io.tensor_order import FRAMES, ORDERS, matrices, pack
+from hks_jax.io.tensor_order import FRAMES, ORDERS, Frame, Order, matrices, pack
 from hks_jax.io.units import UNITS, Unit, by_axis, in_mm2_per_s, unit_in
 from hks_jax.io.volume import AXES, Format, TensorVolume, corners, describe_tensors, images_of, own_record, placed
 from hks_jax.naming import argument
@@ -32,6 +32,8 @@ _LENGTHS = {0: ("", 1.0), 1: ("m", 1e3), 2: ("mm", 1.0), 3: ("um", 1e-3)}
 if another program wrote the file; the record of `save_tensors` tells whether the unit is known."""
 _HEADERS_OF_2 = (b"\x1c\x02\0\0", b"\0\0\x02\x1c")
 """The first bytes of NIfTI-2, the size of its header in both byte orders."""
+REPETITION_TIME = "RepetitionTime"
+"""BIDS's name of the time between the images of a series, in seconds."""
 SCALAR = {"Type": "scalar"}
 """The entry OrientationEncoding that the draft of BIDS for diffusion derivatives (BIDS Extension Proposal 16) requires
 for images of more than three dimensions, here if the fourth axis has times, and not directions."""
@@ -86,6 +88,16 @@ def _warn_of_zero_spacing(name: str, image: Any) -> None:
         )
 
 
+def repetition_time(path: str | os.PathLike[str]) -> dict[str, float]:
+    """Return the time between the images of a series in seconds, by BIDS's name; empty if the file declares none."""
+    if not is_nifti(path):
+        return {}
+    header = optional("nibabel").load(os.fspath(path)).header
+    scale = {8: 1.0, 16: 1e-3, 24: 1e-6}.get(int(header["xyzt_units"]) & 56)
+    known = scale is not None and len(header.get_data_shape()) == 4 and float(header["pixdim"][4]) > 0
+    return {REPETITION_TIME: float(header["pixdim"][4]) * scale} if known and scale else {}
+
+
 def affine_in_mm(name: str, image: Any) -> tuple[np.ndarray, str]:
     """Return the affine with lengths in mm, and the unit of length that the file declares (empty if it has none)."""
     code = int(image.header["xyzt_units"]) & 7
@@ -127,6 +139,23 @@ def _encoding(path: str) -> dict[str, Any]:
             "remove it"
         )
     return encoding
+
+
+class Declared(NamedTuple):
+    """What metadata of BIDS declare about tensors; None for what they do not declare."""
+
+    order: Order | None
+    frame: Frame | None
+    unit: Unit | None
+
+
+def declared_in(metadata: Mapping[str, Any]) -> Declared:
+    """Return the order, the axes and the unit of tensors that metadata of BIDS declare."""
+    encoding, units = metadata.get("OrientationEncoding"), metadata.get("Units")
+    encoding = encoding if isinstance(encoding, dict) else {}
+    frame: Any = _REFERENCES.get(str(encoding.get("Reference")))
+    unit = unit_in(units) if isinstance(units, str) else None
+    return Declared("fsl" if encoding.get("Type") == "tensor" else None, frame, unit)
 
 
 def with_units(volume: TensorVolume, path: str, unit: Unit | None) -> TensorVolume:
@@ -234,6 +263,11 @@ def siblings(path: str | os.PathLike[str]) -> list[str]:
     return names
 
 
+def described_by(paths: Sequence[str]) -> str:
+    """Return the image whose sidecar describes the tensors: the only one, or that of xx among six components."""
+    return next((path for path in paths if len(paths) > 1 and component_of(path) == "xx"), paths[0])
+
+
 def read_components(paths: Sequence[str], order: str | None, frame: str | None) -> TensorVolume:
     """Read tensors from six images in any sequence; each file's name states its component.
 
@@ -284,7 +318,7 @@ def placement_notes(image: Any) -> list[str]:
 
 
 def _write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra: dict[str, Any], record: str) -> None:
-    others = sorted(extra.keys() - {"times"})
+    others = sorted(extra.keys() - {"times", REPETITION_TIME})
     if others:
         raise ValueError(f"extra: got {', '.join(others)}; expected only times for NIfTI. Write an .npz as well")
     if "times" in extra:
@@ -295,7 +329,10 @@ def _write(path: Path, array: np.ndarray, volume: TensorVolume, name: str, extra
         write_json(sidecar_of(path), about | ({"Settings": settings} if settings else {}))
     image = optional("nibabel").Nifti1Image(images_of(array, volume), volume.volume_affine)
     image.header["intent_name"] = name[:15].encode()
-    _store(path, image, record, volume.length_unit)
+    step = extra.get(REPETITION_TIME)
+    if step is not None and len(image.shape) == 4:
+        image.header.set_zooms((*image.header.get_zooms()[:3], float(step)))
+    _store(path, image, record, volume.length_unit, "sec" if step is not None else "unknown")
 
 
 def _write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, Any] | None) -> None:
@@ -308,9 +345,9 @@ def _write_tensors(path: Path, volume: TensorVolume, provenance: Mapping[str, An
     _store(path, image, describe_tensors(volume, "nifti", "voxel", provenance), volume.length_unit)
 
 
-def _store(path: Path, image: Any, record: str, length_unit: str) -> None:
+def _store(path: Path, image: Any, record: str, length_unit: str, time_unit: str = "unknown") -> None:
     nib = optional("nibabel")
-    image.header.set_xyzt_units(length_unit or "unknown")
+    image.header.set_xyzt_units(length_unit or "unknown", time_unit)
     image.header.extensions.append(nib.nifti1.Nifti1Extension("comment", record.encode()))
     with atomic_path(path) as temporary:
         nib.save(image, temporary)

@@ -14,7 +14,10 @@ import nibabel as nib
 import numpy as np
 import pytest
 
-from hks_jax.cli import main
+from hks_jax.cli import build_parser, main
+from hks_jax.cli.study.bids import find_subjects
+from hks_jax.io import read_tensors
+from hks_jax.io.bids import Dataset
 
 GIVEN = ("--metric", "inverse", "--slice", "z=1", "-k", "6", "--boundary", "neumann", "--times", "1e4", "3e4", "-q")
 HKS = "_model-tensor_param-hks"
@@ -107,6 +110,40 @@ def test_options_that_no_input_has_a_use_for_are_refused(tmp_path, app, capsys):
     assert app("participant", *GIVEN, "--b-max", "700") == 2
     assert "--b-max: this option is for diffusion-weighted images, but all participants" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_metadata_that_images_inherit_describe_them(tmp_path):
+    """Six images with one JSON file at the root are read as those with a sidecar each."""
+    frames = {}
+    for name, places in (("own", None), ("root", "model-tensor_dwimap.json")):
+        folder = tree.qsirecon(tmp_path / name, "01")
+        text = json.dumps({"OrientationEncoding": {"Reference": "bvec"}, "Units": "um^2/ms"})
+        files = (
+            [tmp_path / name / places] if places else [p.with_suffix("").with_suffix(".json") for p in folder.iterdir()]
+        )
+        for file in files:
+            file.write_text(text)
+        dataset = Dataset(tmp_path / name)
+        args = build_parser().parse_args(["bids", str(tmp_path / name), "out", "participant"])
+        (subject,) = find_subjects(dataset, ["01"], args)
+        reading = subject.args
+        volume = read_tensors(reading.file, reading.order, frame=reading.frame, unit=reading.unit)
+        frames[name] = volume.tensors, volume.frame, volume.unit
+    np.testing.assert_array_equal(frames["own"][0], frames["root"][0])
+    assert frames["own"][1:] == frames["root"][1:] == ("fsl", "mm²/s")
+
+
+def test_inputs_without_a_mask_are_told(tmp_path, capsys):
+    for label in ("01", "02"):
+        path = tree.bep16(tmp_path / "in", label)
+    tree.image(path.with_name("sub-02_space-ACPC_label-lesion_mask.nii.gz"), tree.mask())
+    args = build_parser().parse_args(["bids", str(tmp_path / "in"), "out", "participant"])
+    with pytest.warns(UserWarning, match="2 of 2 inputs have no mask desc-brain .* label-lesion_mask"):
+        subjects = find_subjects(Dataset(tmp_path / "in"), ["01", "02"], args)
+    assert [subject.args.mask for subject in subjects] == [None, None]
+    tree.image(path.with_name("sub-02_space-ACPC_desc-brain_mask.nii.gz"), tree.mask())
+    with pytest.warns(UserWarning, match="1 of 2 inputs have no mask desc-brain on their voxels .the first is sub-01"):
+        find_subjects(Dataset(tmp_path / "in"), ["01", "02"], args)
 
 
 @pytest.mark.slow

@@ -237,7 +237,10 @@ def test_method_auto_reports_which_times_came_from_where(npz, tmp_path):
     out = tmp_path / "out"
     arguments = ["-k", "25", "--times", "0.1", "4", "--method", "auto"]
     assert main(["hks", str(npz), "-o", str(out), "-q", *arguments]) == 0
-    method = json.loads((out / "report.json").read_text())["method"]
+    report = json.loads((out / "report.json").read_text())
+    method, (early, late) = report["method"], report["times"]
+    assert (early["truncation"], early["truncation_worst_node"]) == (None, None)  # no eigenpairs, none omitted
+    assert 0 <= late["truncation"] < 1e-4
     assert method["eigenpairs"] == [4]
     assert method["selected-inversion"] == [0.1]
     assert method["agreement"]["t"] == 4

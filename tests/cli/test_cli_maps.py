@@ -274,7 +274,10 @@ def test_maps_are_smoothed_by_tensors_on_tetrahedra(boundary, tmp_path, rng):
 @pytest.mark.slow
 def test_maps_are_smoothed_as_by_the_library(tensors, tmp_path, capsys):
     f = np.random.default_rng(1).normal(size=(*SHAPE, 2))
-    nib.save(nib.Nifti1Image(f, AFFINE), tmp_path / "bold.nii.gz")
+    series = nib.Nifti1Image(f, AFFINE)
+    series.header.set_xyzt_units("mm", "msec")
+    series.header.set_zooms((*series.header.get_zooms()[:3], 2500))
+    nib.save(series, tmp_path / "bold.nii.gz")
     out, name = tmp_path / "out", str(tmp_path / "bold.nii.gz")
     volume = hj.io.read_tensors(tensors).with_mask(MASK)
     command = ["smooth", name, "--tensors", tensors, "-o", str(out), "-q"]
@@ -286,6 +289,8 @@ def test_maps_are_smoothed_as_by_the_library(tensors, tmp_path, capsys):
         field = hj.TensorField.from_diffusion(volume.grid("all"), volume.tensors, **settings)
         np.testing.assert_allclose(found, hj.smooth(field, np.moveaxis(f, -1, 0), 6.0, boundary), atol=1e-5)
         assert (out / "smoothed.png").stat().st_size > 5000
+    header = nib.load(out / "smoothed.nii.gz").header
+    assert (header.get_zooms()[3], header.get_xyzt_units()[1]) == (2.5, "sec")
     assert main([*command, "--fwhm", "2"]) == 2
     assert "--fwhm: got 2 on a grid with the spacing 3, which does not resolve it" in capsys.readouterr().err
     f[3, 3, 2, 1] = np.nan

@@ -156,6 +156,9 @@ def test_six_images_are_the_tensors_that_they_are_the_components_of(tmp_path):
 def test_six_images_say_by_their_sidecar_along_which_axes_they_are(tmp_path):
     paths = write_six(tmp_path, tensors())
     sidecar = tmp_path / "sub-01_model-tensor_param-txx_dwimap.json"
+    sidecar.write_text(json.dumps({"Units": "um^2/ms"}))
+    for given in (paths, paths[::-1], paths[4]):  # the sidecar of xx describes all six
+        assert read_tensors(given).unit == "mm²/s"
     for reference, frame in (("xyz", "world"), ("bvec", "fsl"), ("ijk", "voxel")):
         sidecar.write_text(json.dumps({"OrientationEncoding": {"Reference": reference}}))
         expected = read_tensors(paths, frame=frame)
@@ -280,7 +283,7 @@ def test_a_study_that_was_stopped_and_one_that_was_not_have_the_same_bytes(study
     assert {row["index"] for row in table(study / "whole" / "group_regions.tsv")} == {"3"}
 
 
-def test_a_study_is_a_bids_derivative(study, monkeypatch):
+def test_a_study_is_a_bids_derivative(study, monkeypatch, capsys):
     monkeypatch.setattr(
         "hks_jax.cli.study.tasks.signature_panels", lambda result, path, **_: path.write_text("picture")
     )
@@ -290,8 +293,16 @@ def test_a_study_is_a_bids_derivative(study, monkeypatch):
     assert (about["DatasetType"], about["GeneratedBy"][0]["Name"]) == ("derivative", "hks-jax")
     assert (out / "logs" / "sub-01.log").read_text().splitlines()[-1] == "done"
     assert not list(out.glob("*.tsv"))  # the command without --only collects
-    lines = (study / "subjects.tsv").read_text().splitlines()
-    (study / "subjects.tsv").write_text("\n".join(lines[:2]))
+    head, first, *_ = (study / "subjects.tsv").read_text().splitlines()
+    again = first.replace("control", "patient")
+    sessions = [f"{head}\tsession_id\tage", f"{first}\t\tn/a", f"{again}\tses-2\t31"]
+    (study / "subjects.tsv").write_text("\n".join(sessions))
+    with monkeypatch.context() as patch:
+        patch.setattr("hks_jax.cli.study.tasks._compute", None)
+        main([*command(study, "out", "--times", "3e3"), "-q"])
+    assert table(out / "participants.tsv") == [{"participant_id": "sub-01", "group": "control", "age": "31"}]
+    assert "group differs between sessions of sub-01, and participants.tsv has the first" in capsys.readouterr().err
+    (study / "subjects.tsv").write_text("\n".join([head, first]))
     (out / "participants.tsv").write_text("participant_id\tgroup\nsub-01\told\nsub-07\tgone\n")
     with monkeypatch.context() as patch:
         patch.setattr("hks_jax.cli.study.tasks._compute", None)

@@ -192,6 +192,15 @@ def test_a_background_of_nan_is_outside(scan):
     np.testing.assert_allclose(fit.tensors[fit.mask], np.broadcast_to(D * FSL, (fit.mask.sum(), 3, 3)), atol=1e-8)
 
 
+def test_arguments_of_a_fit_are_named(scan):
+    with pytest.raises(ValueError, match="mask: got a mask without voxels"):
+        scan.fit(np.zeros(head().shape, bool))
+    with unchecked(), pytest.raises(ValueError, match="unit: got 'x'; expected one of mm2/s"):
+        scan.fit(head(), unit="x")
+    with unchecked(), pytest.raises(ValueError, match="b_max: got '1000'"):
+        scan.fit(head(), b_max="1000")
+
+
 def test_an_image_without_signal_is_named(scan):
     scan.signal[..., 7] = np.nan
     with pytest.raises(ValueError, match=r"d\.nii\.gz: the used images 7 \(from 0\) have no positive finite signal"):

@@ -290,6 +290,10 @@ def test_masks_of_every_kind_of_file(tmp_path, volume):
     write_components(tmp_path / "m.nii.gz", volume.mask.astype(np.uint8)[..., None], volume.affine)
     for name in ("m.npy", "m.npz", "m.nii.gz"):
         np.testing.assert_array_equal(read_mask(tmp_path / name), volume.mask)
+    moved = volume.affine @ np.diag([-1.0, 1, 1, 1])
+    np.savez(tmp_path / "m.npz", mask=volume.mask, affine=moved)
+    with pytest.raises(ValueError, match=r"m\.npz: the affine displaces this image"):
+        read_mask(tmp_path / "m.npz", volume.affine)
 
 
 def test_bad_masks(tmp_path, volume):

@@ -266,7 +266,7 @@ def test_masks_and_labels(tmp_path, volume):
     header["space origin"] = LPS @ ORIGIN
     nrrd.write(str(tmp_path / "m.nrrd"), volume.mask.astype(np.uint8), header, index_order="F")
     np.testing.assert_array_equal(read_mask(tmp_path / "m.nrrd", volume.affine), volume.mask)
-    labels = np.arange(volume.mask.size).reshape(SHAPE)
+    labels = np.arange(volume.mask.size).reshape(SHAPE) + 3_000_000_000
     nrrd.write(str(tmp_path / "labels.nrrd"), labels, header, index_order="F")
     np.testing.assert_array_equal(read_labels(tmp_path / "labels.nrrd", volume), labels)
     np.testing.assert_array_equal(read_labels(tmp_path / "labels.nrrd", volume.slice("y", 2)), labels[:, 2])

@@ -28,6 +28,7 @@ import argparse
 import copy
 from pathlib import Path
 
+from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.cli.combinations import refuse
 from hks_jax.cli.parsing import folder
 from hks_jax.cli.progress import Progress
@@ -35,9 +36,11 @@ from hks_jax.cli.study import settings
 from hks_jax.cli.study.folder import written_in
 from hks_jax.cli.study.subjects import Subject
 from hks_jax.io.bids import Dataset, Source, are_entities, kept, parse_entities
+from hks_jax.io.nifti import component_of, declared_in, is_nifti
 
 USAGE = "BIDS_DIR OUT LEVEL"
-_BRAIN = {"desc": "brain"}
+_BRAIN = {"desc": "brain", "label": "brain"}
+"""The entities of the usual masks; other labels are those of lesions or tissues."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -132,7 +135,23 @@ def find_subjects(dataset: Dataset, participants: list[str], args: argparse.Name
             subjects.append(Subject({"sub": label}, None, str(error), of))
     if subjects and not any(subject.arguments for subject in subjects):
         raise ValueError(subjects[0].problem)
+    if args.mask is None:
+        _tell_of_masks(dataset, subjects)
     return subjects
+
+
+def _tell_of_masks(dataset: Dataset, subjects: list[Subject]) -> None:
+    """Warn of subjects without a mask, unless no participant has one."""
+    found = [subject for subject in subjects if subject.arguments is not None]
+    lacking = [subject for subject in found if subject.args.mask is None]
+    unused = [mask for subject in lacking for mask in dataset.masks(subject.entities["sub"])]
+    if lacking and (unused or len(lacking) < len(found)):
+        why = f". {unused[0]} has another space or label" if unused else ""
+        warn_of_accuracy(
+            f"--mask: {len(lacking)} of {len(found)} inputs have no mask desc-brain on their voxels (the first is "
+            f"{lacking[0].name}), so that their domain is the whole image{why}. Pass --mask",
+            UserWarning,
+        )
 
 
 def _arguments(dataset: Dataset, source: Source, args: argparse.Namespace) -> argparse.Namespace:
@@ -150,7 +169,10 @@ def _arguments(dataset: Dataset, source: Source, args: argparse.Namespace) -> ar
         own.frame = own.order = None
     else:
         own.bval = own.bvec = own.bvec_frame = own.b_max = None
-        own.order = args.order or source.order
+        inherited = declared_in(dataset.inherited(source.file))
+        whole = is_nifti(source.file.path) and component_of(source.file.path) is None
+        own.order = args.order or source.order or (inherited.order if whole else None)
+        own.frame, own.unit = args.frame or inherited.frame, args.unit or inherited.unit
     return own
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.cli.study.folder import FAILED, MAP, REGIONS, Study
 from hks_jax.cli.study.subjects import Subject
 from hks_jax.io.json_files import read_json
@@ -80,7 +81,19 @@ def _write_participants(study: Study, subjects: list[Subject]) -> list[Path]:
     file = study.folder / "participants.tsv"
     before = read_table(file) if file.is_file() else []
     rows = {who: row for row in before if (study.folder / (who := row.pop("participant_id"))).is_dir()}
-    rows |= {subject.participant: dict(subject.covariates) for subject in reversed(subjects)}  # of the first session
+    own, differing = dict[str, dict[str, str]](), dict[str, list[str]]()
+    for subject in subjects:
+        first = own.setdefault(subject.participant, {})
+        for name, value in subject.covariates.items():
+            if first.setdefault(name, value) != value:
+                differing.setdefault(name, []).append(subject.participant)
+    for name, whose in differing.items():
+        warn_of_accuracy(
+            f"{name} differs between sessions of {', '.join(dict.fromkeys(whose))}, and participants.tsv has the first "
+            "value. Join the values of sessions from your own table",
+            UserWarning,
+        )
+    rows |= own
     columns = list(dict.fromkeys(name for row in rows.values() for name in row))
     return write_table(
         file, ("participant_id", *columns), [(who, *map(rows[who].get, columns)) for who in sorted(rows)]
