@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import nibabel as nib
 import numpy as np
 import pytest
+from annotations import unchecked
 
 import hks_jax as hj
 from hks_jax.cli import main
