@@ -113,6 +113,7 @@ def test_curvature_end_to_end(sphere, tmp_path, capsys):
     assert min(png_size(tmp_path / "K.png")) > 300
 
 
+@pytest.mark.slow
 def test_the_total_curvature_obeys_gauss_and_bonnet(tmp_path, capsys):
     """On a zone of the unit sphere in latitude and longitude, ∫K = 2π(cos θ₀ − cos θ₁); sides have half cells."""
     n, m, low, high = 41, 48, 0.3, 2.6

@@ -124,7 +124,7 @@ def test_nodal_curvature_converges_at_high_order(periodic):
     ("source", "order"),
     [
         pytest.param("function", 2, marks=pytest.mark.slow),
-        ("nodal", 1),
+        pytest.param("nodal", 1, marks=pytest.mark.slow),
         pytest.param("nodal", 2, marks=pytest.mark.slow),
     ],
 )

@@ -253,7 +253,7 @@ def test_a_filter_changes_only_blocks_with_a_vector_that_is_not_accurate():
         np.testing.assert_array_equal(found[8:], state.vectors[8:])
 
 
-@pytest.mark.parametrize("boundary", ["mean", pytest.param("dirichlet", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("boundary", [pytest.param("mean", marks=pytest.mark.slow), "dirichlet"])
 def test_pairs_of_similar_tensors_are_a_start(rng, boundary):
     shape, k, told = (12, 11, 10), 16, []
     grid, tensors = hj.Grid(shape, 0.1, mask=masked(shape)), random_spd(rng, shape, 0.2)
@@ -307,6 +307,7 @@ def test_multiplicities_of_a_cube_are_complete():
     np.testing.assert_allclose(pairs.eigenvalues, expected, atol=1e-10 * expected[-1])
 
 
+@pytest.mark.slow
 def test_single_precision_where_a_coarse_grid_has_fewer_low_modes_than_vectors():
     # The random start on 8³ nodes leaves 32 vectors so dependent that rounding makes their Gram matrix indefinite.
     field, k, told = flat((16, 16, 16), (1.0, 1.1, 1.23)), 10, []

@@ -122,6 +122,7 @@ def test_of_elements_with_the_derivative_by_the_metric():
     np.testing.assert_allclose(slope, directional(lambda s: torus(np.sqrt(s), 1.0), 1.1, 1.0, 1e-3), atol=0.03)
 
 
+@pytest.mark.slow
 def test_pairs_that_a_compiled_function_closes_over():
     pairs = pairs_with(of_product(*SIDES, 2 * np.arange(-30, 31)), 2.6)
     known = hj.heat_coefficients(pairs, 0)

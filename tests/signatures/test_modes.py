@@ -499,7 +499,8 @@ def test_alignment_of_even_and_odd_modes_and_of_another_subject(rng):
     assert 0 < np.abs(after / before - 1).max() < 0.03
 
 
-@pytest.mark.parametrize("boundary", ["neumann", pytest.param("mirror", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("boundary", ["neumann", "mirror"])
 def test_aligned_modes_have_derivatives_by_the_tensors(boundary, rng):
     """Each problem has simple eigenvalues, so the rotations are signs: the slope is that by differences."""
     field = flat((7, 6), (1.0, 1.3))

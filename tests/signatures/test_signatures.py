@@ -102,12 +102,10 @@ def test_scale_invariance_takes_log_spaced_times(pairs):
     single = hj.eigenpairs(flat((6, 7), (1.0, 1.1)), 42, solver="dense")
     single = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, single)
     for given in (pairs, single):
-        for times in (np.geomspace(2.0, 8.0, 300), np.geomspace(8.0, 2.0, 20), [2.0], [2.0, 3.0]):
+        for times in (np.geomspace(2.0, 8.0, 300), np.geomspace(8.0, 2.0, 4)):
             hj.scale_invariant_hks(given, 1, times=times)
         with pytest.raises(ValueError, match=r"times: got steps of log t from 0.2877 to 0.6931; expected equal steps"):
             hj.scale_invariant_hks(given, 2, times=[2.0, 4.0, 6.0, 8.0])
-    found = jax.jit(lambda t: hj.scale_invariant_hks(pairs, 2, times=t))(jnp.array([2.0, 4.0, 6.0]))
-    assert np.isfinite(found[:, pairs.space.domain]).all()
 
 
 def test_wks_tells_of_energies_to_which_pairs_are_missing():
@@ -176,7 +174,12 @@ def test_default_times_span_the_spectrum(field):
 
 @pytest.mark.parametrize(
     ("shape", "boundary", "potential"),
-    [((12, 13), "neumann", None), ((12, 13), "dirichlet", None), ((7, 6, 7), "mean", None), ((12, 13), "neumann", 5.0)],
+    [
+        ((12, 13), "neumann", None),
+        ((12, 13), "dirichlet", None),
+        ((12, 13), "neumann", 5.0),
+        pytest.param((7, 6, 7), "mean", None, marks=pytest.mark.slow),
+    ],
 )
 def test_the_biharmonic_distance_tells_what_few_pairs_lack(shape, boundary, potential):
     """The mean over all sources and nodes of the squared distance, against all eigenpairs."""

@@ -368,6 +368,7 @@ def test_intervals_contain_the_truth_as_often_as_they_say(rng):
         np.testing.assert_allclose(np.mean(found, axis=(0, 2)), level, atol=0.06)
 
 
+@pytest.mark.slow
 def test_seeds_in_a_batch_give_the_draws_of_each(rng):
     D = jnp.asarray(random_spd(rng, (5, 6), 0.3))
     noise = hj.TensorNoise.relative(D, 0.05)
