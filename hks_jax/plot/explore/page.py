@@ -99,7 +99,7 @@ def explore(
         '<!doctype html>'
     """
     require_result(result)
-    axes, turned, facts = None, None, _facts(result)
+    axes, turned, facts, stored = None, None, _facts(result), result.place
     grey = None if anatomy is None else _grey(anatomy, result)
     if isinstance(result.place, TensorVolume) and (turned := placed(result.place, None, view)) is not None:
         result, maps, labels, axes = _turned(result, maps, labels, turned)
@@ -172,7 +172,7 @@ def explore(
         "shape": shown_inside.shape,
         "offset": [part.start for part in box],
         **place,
-        **_in_space(result, axes),
+        **_in_space(stored, axes),
         "ends": None if turned is None else list(turned.ends),
         "mirrored": view == "radiological",
         "unit": result.unit if unit is None else unit,
@@ -295,6 +295,7 @@ def _turned(
         mask=by.array(volume.inside),
         spacing=grid.spacing,
         origin=grid.origin,
+        affine=None,
         covariance=None,
         modes=None,
     )
@@ -305,9 +306,8 @@ def _turned(
     return result, {k: by.array(v) for k, v in (maps or {}).items()}, None if labels is None else by.array(labels), axes
 
 
-def _in_space(result: Result, axes: _Axes | None) -> dict[str, Any]:
+def _in_space(volume: Any, axes: _Axes | None) -> dict[str, Any]:
     """Return the matrix from the volume's indices to coordinates in space, and the indices of shown nodes."""
-    volume = result.place
     if not isinstance(volume, TensorVolume) or volume.affine is None or axes is None:
         return {"world": None, "axes": None}
     matrix = volume.affine[:3, [a for a in range(4) if volume.dimension == 3 or a != volume.thin_axis]]
