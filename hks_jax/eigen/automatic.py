@@ -123,6 +123,7 @@ def _automatic(pencil: Pencil, k: int) -> Eigensolver:
         return ShiftInvert(adjoint=FactorisedAdjoint()) if exact and planar else ShiftInvert()
     if not laplacian:
         return ShiftInvert() if n * k < _LARGE else ours
+    # On tetrahedra and on float32 surfaces, `ours` is block Lanczos but not suited, so that shift-invert is chosen.
     # In float32, block Lanczos factorises in float32; so it searches repeatedly, and leaves some pairs unconverged.
     suited = BlockLanczos if planar and exact else ChebyshevFilter
     large = _LARGE if exact or not planar else _LARGE_FOR_COMMAND

@@ -70,7 +70,7 @@ def _solved_jvp(
     n_dof, adjoint = pencil.size, solver.adjoint
     guards = max(extra, min(solver.guards(k, n_dof), solver.max_pairs(n_dof) - k))
     found, vectors, complete_below = one_by_one(_lowest, (solver, k + guards, report), pencil, start)
-    eigenvalues, functions, following, spare = _cut(found, vectors, k)
+    eigenvalues, frame, following, spare = _cut(found, vectors, k)
     vectors = vectors if spare is None else vectors[: len(found)]
     origin, from_origin, solves = jnp.zeros((), found.dtype), found, _solves(pencil, k, len(found))
     if solves and pencil.null_space is None:  # linear solves need K ⪰ 0
@@ -81,10 +81,10 @@ def _solved_jvp(
     # Metric and density are removed: derivatives do not need them, and reverse mode would store their arrays.
     pencil = replace(pencil, metric=None, density=None)
     on_failure: OnFailure = "error" if throw else "nothing" if is_traced(primals) else "warning"
-    constants, settings = _Constants(prepared, pencil, origin, from_origin, vectors, functions), (adjoint, on_failure)
-    tangents = linear_program(_tangents, settings, (constants,), change, (eigenvalues, functions), _host_map)
+    constants, settings = _Constants(prepared, pencil, origin, from_origin, vectors, frame), (adjoint, on_failure)
+    tangents = linear_program(_tangents, settings, (constants,), change, (eigenvalues, frame), _host_map)
     others = following if extra else jnp.full_like(following, jnp.inf), complete_below, spare
-    return (eigenvalues, functions, *others), (*tangents, *jax.tree.map(jnp.zeros_like, others))
+    return (eigenvalues, frame, *others), (*tangents, *jax.tree.map(jnp.zeros_like, others))
 
 
 class _Constants(NamedTuple):
@@ -95,7 +95,7 @@ class _Constants(NamedTuple):
     origin: Scalar  # σ
     values: Values  # (p,) the eigenvalues of K − σM and M
     vectors: Vectors
-    functions: Rows  # the first k vectors, because slicing ``vectors`` would copy the slice
+    frame: Rows  # the first k vectors, because slicing ``vectors`` would copy the slice
 
 
 # `one_by_one` needs the same function object in every call; so `_lowest` and `_prepare` are at module level.
@@ -131,10 +131,10 @@ def _solves(pencil: SymmetricPencil, k: int, p: int) -> bool:
 
 def _host_map(adjoint: Adjoint, on_failure: OnFailure, constants: _Constants) -> HostMap | None:
     """Return `_tangents` by NumPy."""
-    prepared, pencil, origin, values, vectors, functions = constants
+    prepared, pencil, origin, values, vectors, frame = constants
     if vectors.size > _ON_HOST:
         return None
-    k, rows = len(functions), np.asarray(functions)
+    k, rows = len(frame), np.asarray(frame)
     guards = np.asarray(vectors)[k:]
     eigenvalues = (np.asarray(values)[:k] + np.asarray(origin))[:, None]
     _, inverse = gaps(np.asarray(values), k, np.asarray(indistinct(pencil, values.dtype)))
@@ -178,11 +178,11 @@ def _tangents(
     adjoint: Adjoint, on_failure: OnFailure, constants: _Constants, change: SymmetricPencil
 ) -> tuple[OfRows, Rows]:
     """Return the tangents of the first k eigenvalues, and of the frame of `solved`, for the change of K and M."""
-    prepared, pencil, origin, values, vectors, functions = constants
-    k = len(functions)
+    prepared, pencil, origin, values, vectors, frame = constants
+    k = len(frame)
     eigenvalues, guards = values[:k] + origin, vectors[k:]
-    moved = change.mass.apply(functions)
-    force = change.stiffness.apply(functions) - eigenvalues[:, None] * moved
+    moved = change.mass.apply(frame)
+    force = change.stiffness.apply(frame) - eigenvalues[:, None] * moved
     _, inverse = gaps(values, k, indistinct(pencil, values.dtype))
 
     # `onto_guards` is symmetric, so it is its own transpose. JAX's automatic transpose would be several times slower.
@@ -200,7 +200,7 @@ def _tangents(
         free = np.arange(k)[:, None] >= pencil.n_fixed
         rhs = jnp.where(free, -force, 0)
         of_frame = of_frame + jnp.where(free, jax.lax.custom_linear_solve(lambda x: x, rhs, solve, symmetric=True), 0)
-    return jnp.sum(functions * force, axis=1), of_frame
+    return jnp.sum(frame * force, axis=1), of_frame
 
 
 def _prepare(adjoint: Adjoint, k: int, pencil: SymmetricPencil, values: Values) -> Any:

@@ -9,7 +9,7 @@ from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import require_static
 from hks_jax.eigen.all_pencils import pairs_of_pencils
 from hks_jax.eigen.eigenpairs import RESULTS, Eigenpairs
-from hks_jax.eigen.multiplets import SPARE, MultipletChoice
+from hks_jax.eigen.multiplets import TO_COMPLETE, MultipletChoice
 from hks_jax.eigen.solver import Eigensolver, Report, silent
 from hks_jax.fem.assembly import MassKind
 from hks_jax.fem.boundary import BoundarySpec
@@ -92,7 +92,7 @@ def eigenpairs(
         remedy = ". Use a smaller k or a finer grid" * bool(real and number > total)
         raise ValueError(f"k: got {k}; expected an integer from 1 to {total}, the number of degrees of freedom{remedy}")
     k = int(number)
-    size = min(k + SPARE, total) if multiplet == "complete" else k
+    size = min(k + TO_COMPLETE, total) if multiplet == "complete" else k
     pairs = pairs_of_pencils(pencil, solver, size, throw, progress or silent, start).truncated(k, multiplet)
     found = jax.lax.stop_gradient(pairs)
     if is_traced(found.eigenvalues):

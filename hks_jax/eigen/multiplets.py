@@ -68,7 +68,7 @@ def _ends_of_multiplets(spectrum: Spectrum) -> Any:
 
 MultipletChoice = Literal["report", "drop", "complete"]
 
-SPARE = 8
+TO_COMPLETE = 8
 """The number of pairs beyond k that are computed to complete a multiple eigenvalue."""
 
 

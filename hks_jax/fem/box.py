@@ -26,19 +26,19 @@ class Box(NamedTuple):
 
     Attributes:
         pencil: the pencil.
-        space: the space of the unknowns of the given pencil, on the nodes of the box.
+        unknowns: the space of the given pencil's unknowns, on the nodes of the box.
     """
 
     pencil: Pencil
-    space: FunctionSpace
+    unknowns: FunctionSpace
 
     def into(self, rows: Float[Array, "m n_dof"]) -> Float[Array, "m n_box"]:
         """Return functions of the given unknowns as those of the box."""
-        return self.space.transfer(rows, self.pencil.space)
+        return self.unknowns.transfer(rows, self.pencil.space)
 
     def out_of(self, rows: Float[Array, "m n_box"]) -> Float[Array, "m n_dof"]:
         """Return functions of the box as those of the given unknowns."""
-        return self.pencil.space.transfer(rows, self.space)
+        return self.pencil.space.transfer(rows, self.unknowns)
 
 
 def in_box(pencil: Pencil, k: int) -> Box:
