@@ -92,7 +92,7 @@ def hks_expansion(
             f"that are implemented in {dimension} dimensions"
         )
     t, wraps = checked_times(times, field.tensors.dtype), wraps_per_axis(periodic, dimension)
-    coefficients = _coefficients(field, int(order), wraps)
+    coefficients = _coefficients(field, int(order), wraps, 0)
     if not is_traced(t) and t.size:
         # Less than 0.1 % of the signature at the largest time does not count.
         negligible = [1e-3 / float(np.asarray(t).max()) ** i for i in range(1, order + 1)]
@@ -104,7 +104,7 @@ def hks_expansion(
 
 
 @partial(jax.jit, static_argnums=(1, 2))
-def _coefficients(field: TensorField, order: int, wraps: tuple[bool, ...], lower: Any = 0) -> Coefficients:
+def _coefficients(field: TensorField, order: int, wraps: tuple[bool, ...], lower: Any) -> Coefficients:
     if field.function is None:
         coefficients, known = _nodal(field, order, wraps, lower)
     else:

@@ -66,7 +66,8 @@ def gaussian_curvature(field: TensorField, periodic: bool | Sequence[bool] = Fal
     median of |K|, and 1/area. Then smooth the tensors (`smooth_tensors`), and compute error bars (`uncertainty`).
 
     An `AccuracyWarning` is also issued if the grid does not resolve the metric: if the error of the differences,
-    estimated by differences of lower order, exceeds a quarter of the median of |K| at over 2 % of the nodes.
+    estimated by differences of lower order, exceeds a quarter of the median of |K| at over 2 % of the nodes. Near sides
+    the estimate may be half of the error.
 
     Args:
         periodic: whether the axes are periodic, so that node n is node 0; one value for all axes, or one per axis.
@@ -92,14 +93,14 @@ def _curvature(
     name: str, curvature: Callable[[Jet], Array], field: TensorField, wraps: tuple[bool, ...]
 ) -> Float[Array, "*shape"]:
     """Return a curvature at the nodes, and warn if noise dominates it, or if the grid does not resolve the metric."""
-    values = _at_nodes(curvature, field, wraps)
+    values = _at_nodes(curvature, field, wraps, 0)
     warn_of_errors(field, lambda f, lower: [_at_nodes(curvature, f, wraps, lower)], [values], [name], [0.0], wraps)
     return values
 
 
 @partial(jax.jit, static_argnums=(0, 2))
 def _at_nodes(
-    curvature: Callable[[Jet], Array], field: TensorField, wraps: tuple[bool, ...], lower: Any = 0
+    curvature: Callable[[Jet], Array], field: TensorField, wraps: tuple[bool, ...], lower: Any
 ) -> Float[Array, "*shape"]:
     metric, known = metric_jet(field, wraps, lower)
     return nan_outside(curvature(metric), known)

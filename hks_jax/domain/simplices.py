@@ -165,8 +165,8 @@ def _warn_of_pinched(triangulation: Triangulation) -> None:
         listed = ", ".join(map(str, cells[:8])) + " …" * (cells.size > 8)
         warn_of_accuracy(
             f"{words.argument}: at {found.size} vertices, parts of the mesh touch without sharing {shared} there (the "
-            f"first is vertex {first}, with the {words.argument} {listed}). No heat flows through a point, but it "
-            "flows through a common vertex, the more the coarser the mesh: results depend on the mesh. Give each part "
+            f"first is vertex {first}, with the {words.argument} {listed}). Heat cannot pass through a point, but "
+            "it passes through a shared vertex, more on a coarser mesh, so results depend on the mesh. Give each part "
             f"a vertex of its own there, or join the parts by {words.simplices} that share {shared}"
         )
 

@@ -175,7 +175,9 @@ class Nodal(Unknowns):
     def edges(self) -> Bool[np.ndarray, "d *shape"]:
         """For each axis, whether each node and the next node along the axis are in the domain."""
         grid = self.init.grid
-        domain = np.isin(np.arange(grid.size), self.nodes.value).reshape(grid.shape)
+        domain = np.zeros(grid.size, bool)
+        domain[self.nodes.value] = True
+        domain = domain.reshape(grid.shape)
         both = np.stack([domain & np.roll(domain, -1, axis) for axis in range(grid.dimension)])
         for axis, wraps in enumerate(self.periodic):
             if not wraps:

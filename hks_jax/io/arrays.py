@@ -9,8 +9,8 @@ from jaxtyping import Float
 
 from hks_jax.domain.grid import per_axis
 from hks_jax.io.tensor_order import Matrices, matrices, to_voxel_axes
-from hks_jax.io.units import in_mm2_per_s, unit_in
-from hks_jax.io.volume import Format, TensorVolume, describe_tensors, mask_in_file, spacing_of
+from hks_jax.io.units import UNITS, in_mm2_per_s, unit_in
+from hks_jax.io.volume import Format, TensorVolume, describe_tensors, mask_in_file, require_affine, spacing_of
 from hks_jax.storage import load_npy, load_npz, write_npz
 
 
@@ -21,8 +21,11 @@ def _read_image(name: str) -> tuple[np.ndarray, np.ndarray | None, str]:
     arrays = load_npz(name)
     if "mask" not in arrays:
         raise ValueError(f"{name}: got the arrays {', '.join(sorted(arrays)) or 'none'}; expected an array 'mask'")
-    affine = arrays.get("affine") if arrays["mask"].ndim == 3 else None  # a slice's affine is not that of its volume
-    return arrays["mask"], None if affine is None else _real(f"{name}: affine", affine), ""
+    if "affine" not in arrays or arrays["mask"].ndim != 3:  # a slice's affine is not that of its volume
+        return arrays["mask"], None, ""
+    affine = _real(f"{name}: affine", arrays["affine"])
+    require_affine(name, affine)
+    return arrays["mask"], affine, ""
 
 
 def _read_tensors(
@@ -74,6 +77,8 @@ def volume_of(name: str, arrays: Mapping[str, Any], tensors: Float[np.ndarray, "
         spacing = 1.0
         if affine is not None and affine.shape == (4, 4) and axis in (None, 0, 1, 2):
             spacing = spacing_of(affine, d, axis)
+    if text and unit is None:
+        raise ValueError(f"{name}: unit: got {text!r}; expected one of {', '.join(UNITS)}")
     volume = TensorVolume(
         tensors,
         per_axis(f"{name}: spacing", spacing, d),
@@ -82,7 +87,6 @@ def volume_of(name: str, arrays: Mapping[str, Any], tensors: Float[np.ndarray, "
         affine,
         axis,
         length_unit=_text(arrays, "length_unit"),
-        unit=text if unit is None else "",
         **about,
     )
     return volume if unit is None else in_mm2_per_s(volume, unit, "which the file declares")

@@ -94,8 +94,8 @@ def repetition_time(path: str | os.PathLike[str]) -> dict[str, float]:
         return {}
     header = optional("nibabel").load(os.fspath(path)).header
     scale = {8: 1.0, 16: 1e-3, 24: 1e-6}.get(int(header["xyzt_units"]) & 56)
-    known = scale is not None and len(header.get_data_shape()) == 4 and float(header["pixdim"][4]) > 0
-    return {REPETITION_TIME: float(header["pixdim"][4]) * scale} if known and scale else {}
+    step = float(header["pixdim"][4])
+    return {REPETITION_TIME: step * scale} if scale and len(header.get_data_shape()) == 4 and step > 0 else {}
 
 
 def affine_in_mm(name: str, image: Any) -> tuple[np.ndarray, str]:

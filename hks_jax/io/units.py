@@ -62,7 +62,10 @@ def in_mm2_per_s(volume: TensorVolume, unit: Unit, why: str = "as asked") -> Ten
     if unit not in UNITS:
         raise ValueError(f"unit: got {unit!r}; expected one of {', '.join(UNITS)}")
     if volume.unit:
-        raise ValueError(f"unit: got {unit!r}, but {volume.source} declares {volume.unit}. Leave this argument out")
+        raise ValueError(
+            f"unit: got {unit!r}, but {volume.source} declares its unit, and its numbers are in {volume.unit} now. "
+            "Leave this argument out"
+        )
     scale = UNITS[unit]
     if scale == 1:
         return replace(volume, unit=MM2_PER_S)

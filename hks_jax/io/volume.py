@@ -120,10 +120,8 @@ class TensorVolume:
         if mask is not None and not (isinstance(mask, np.ndarray) and mask.shape == shape and mask.dtype == bool):
             got, remedy = describe_array(mask), ". `read_mask` reads a file" * isinstance(mask, str | os.PathLike)
             raise ValueError(f"{where}mask: got {got}; expected a bool array of shape {shape}{remedy}")
-        if (affine := self.affine) is not None and (
-            affine.shape != (4, 4) or not np.isfinite(affine).all() or np.linalg.det(affine[:3, :3]) == 0
-        ):
-            raise ValueError(f"{where}affine: got {affine.tolist()}; expected an invertible matrix of shape (4, 4)")
+        if (affine := self.affine) is not None:
+            require_affine(self.source, affine)
         for name, unit, known in (("length_unit", self.length_unit, "mm"), ("unit", self.unit, "mm²/s")):
             if unit not in ("", known):
                 raise ValueError(f"{where}{name}: got {unit!r}; expected {known!r} or nothing. Convert the numbers")
@@ -246,6 +244,13 @@ class TensorVolume:
     def thin_axis(self) -> int:
         """The axis along which a slice is one voxel thick when it is written as a volume; z by default."""
         return 2 if self.slice_axis is None else self.slice_axis
+
+
+def require_affine(source: str, affine: Float[np.ndarray, "..."]) -> None:
+    """Raise ValueError unless an affine is an invertible matrix of shape (4, 4)."""
+    if affine.shape != (4, 4) or not np.isfinite(affine).all() or np.linalg.det(affine[:3, :3]) == 0:
+        where = f"{source}: " * bool(source)
+        raise ValueError(f"{where}affine: got {affine.tolist()}; expected an invertible matrix of shape (4, 4)")
 
 
 def spacing_of(affine: Float[np.ndarray, "4 4"], d: int, slice_axis: int | None) -> tuple[float, ...]:

@@ -88,8 +88,9 @@ def _warn_of_truncation(pairs: Eigenpairs) -> None:
         return
     if (left := share_of_inverse_squares(pairs)) > TAIL_LIMIT:
         warn_of_accuracy(
-            f"pairs: got {pairs.k}; on average over the domain, an estimated {left:.1%} of the squared biharmonic "
-            "distance lies beyond them (several times as much near a source). Use more eigenpairs"
+            f"pairs: got {int(np.asarray(pairs.kept).sum())}; on average over the domain, an estimated {left:.1%} of "
+            "the squared biharmonic distance lies beyond them (several times as much near a source). Use more "
+            "eigenpairs"
         )
 
 

@@ -132,10 +132,12 @@ def suitable(metric: Any, spacing: Any, inside: Bool[np.ndarray, "*shape"], boun
     volume = float(np.sqrt(np.linalg.det(metric)).sum() * np.prod(spacing) * share)
     size = float(np.sqrt((np.median(along, axis=0) * steps**2).max()))
     rim = boundary_nodes(active_elements(inside, periodic), periodic)
-    beyond = [(n // 2,) * 2 if wraps else (0, 0) for n, wraps in zip(inside.shape, periodic, strict=True)]
-    to_rim = scipy.ndimage.distance_transform_edt(np.pad(~rim, beyond, "wrap"), np.sqrt(np.median(along, axis=0)))
-    within = tuple(slice(low, low + n) for (low, _), n in zip(beyond, inside.shape, strict=True))
-    depth = float(np.median(to_rim[within][inside])) if rim.any() else math.inf
+    depth = math.inf
+    if rim.any():
+        beyond = [(n // 2,) * 2 if wraps else (0, 0) for n, wraps in zip(inside.shape, periodic, strict=True)]
+        to_rim = scipy.ndimage.distance_transform_edt(np.pad(~rim, beyond, "wrap"), np.sqrt(np.median(along, axis=0)))
+        within = tuple(slice(low, low + n) for (low, _), n in zip(beyond, inside.shape, strict=True))
+        depth = float(np.median(to_rim[within][inside]))
     problems = len(doubled_problems(sides))
     spacing2, nodes = float(np.median(along.max(axis=1))), round(len(metric) * share)
     return suitable_times(d, volume, spacing2, size, nodes, problems, depth)

@@ -240,7 +240,7 @@ def _warn_of_misfit(settings: Colouring, times: Float[Array, " m"], late: float,
         )
     else:
         warn_of_accuracy(
-            "method: got a Colouring for a domain on which the largest eigenvalue or the reach of heat is smaller by a "
-            f"factor of {growth:.3g}, so the signature is NaN; expected one for this domain. Make a new one by "
+            f"method: the largest eigenvalue or the reach of heat on this domain is {growth:.3g} times that of the "
+            "Colouring, so the signature is NaN; expected one for this domain. Make a new one by "
             f"`colouring` with this domain, or with a slack {1.005 * growth:.3g} times as large"
         )

@@ -294,6 +294,9 @@ def test_masks_of_every_kind_of_file(tmp_path, volume):
     np.savez(tmp_path / "m.npz", mask=volume.mask, affine=moved)
     with pytest.raises(ValueError, match=r"m\.npz: the affine displaces this image"):
         read_mask(tmp_path / "m.npz", volume.affine)
+    np.savez(tmp_path / "m.npz", mask=volume.mask, affine=moved[:3])
+    with pytest.raises(ValueError, match=r"m\.npz: affine: got .*; expected an invertible matrix of shape \(4, 4\)"):
+        read_mask(tmp_path / "m.npz", volume.affine)
 
 
 def test_bad_masks(tmp_path, volume):

@@ -287,7 +287,7 @@ def test_a_colouring_for_another_metric_or_mass_is_told_with_the_remedy(boundary
         found = hj.hks_spectrum_free(constant(12, 0.5), [2.0], boundary, mass="lumped", method=settings)
     assert np.isnan(found).all()
     (message,) = [str(each.message) for each in told]
-    assert message.startswith("method: got a Colouring for a domain on which the largest eigenvalue")
+    assert message.startswith("method: the largest eigenvalue or the reach of heat on this domain is 2")
     slack = float(message.split("with a slack ")[1].split(" times")[0])
     assert 2 <= slack < 2.05
     wider = hj.colouring(constant(12), [2.0], boundary, mass="lumped", slack=slack)

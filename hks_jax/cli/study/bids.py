@@ -146,10 +146,10 @@ def _tell_of_masks(dataset: Dataset, subjects: list[Subject]) -> None:
     lacking = [subject for subject in found if subject.args.mask is None]
     unused = [mask for subject in lacking for mask in dataset.masks(subject.entities["sub"])]
     if lacking and (unused or len(lacking) < len(found)):
-        why = f". {unused[0]} has another space or label" if unused else ""
+        why = f". {unused[0]} is not used, because its space or label differs" if unused else ""
         warn_of_accuracy(
-            f"--mask: {len(lacking)} of {len(found)} inputs have no mask desc-brain on their voxels (the first is "
-            f"{lacking[0].name}), so that their domain is the whole image{why}. Pass --mask",
+            f"--mask: {len(lacking)} of {len(found)} inputs have no mask desc-brain with their voxels (the first is "
+            f"{lacking[0].name}), so their domain is the whole image{why}. Pass --mask",
             UserWarning,
         )
 

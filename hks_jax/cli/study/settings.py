@@ -138,11 +138,12 @@ def open_study(args: argparse.Namespace, subjects: Callable[[], list[Subject]], 
     changed = [name for name, value in now.items() if then.get(name) != value]
     style, changed = set(changed).intersection(_STYLE), [name for name in changed if name not in OUTPUT]
     earlier = before.get("files", {})
-    other = [name for name in ("mask", *earlier) if before and _is_other(name, earlier.get(name), files.get(name))]
+    names = dict.fromkeys(("mask", *earlier))
+    other = [name for name in names if before and _is_other(name, earlier.get(name), files.get(name))]
     if before and (changed or other) and not args.replace:
         kept = "; ".join(
             [f"{flag(n)} {_spelled(n, then.get(n))}, not {_spelled(n, now[n])}" for n in changed]
-            + [f"{flag(n)} {earlier.get(n, 'unset')}, not {files.get(n, 'unset')}" for n in dict.fromkeys(other)]
+            + [f"{flag(n)} {earlier.get(n, 'unset')}, not {files.get(n, 'unset')}" for n in other]
         )
         raise ValueError(
             f"--output: the study in {args.output} has {kept}. Leave these options out to continue the study, choose "
