@@ -193,6 +193,7 @@ def test_gradients_with_respect_to_tensors_and_vertices(rng, small, at, way, k):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:pairs. got 20; on average:hks_jax.AccuracyWarning")
 def test_everything_that_takes_pairs_takes_these(small):
     mesh = hj.TetMesh(*small)
     pairs = hj.eigenpairs(mesh, 20)
