@@ -761,9 +761,8 @@ def test_a_study_has_errors_of_regions_and_computes_again_what_had_other_noise(s
         assert text in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("scaled", "sees"), [pytest.param(None, True, marks=pytest.mark.slow), (np.array([2.0, 5.0]), False)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("scaled", "sees"), [(None, True), (np.array([2.0, 5.0]), False)])
 def test_noise_of_the_first_eigenvalue_changes_times_that_follow_it(scaled, sees):
     settings = Settings.of(metric="inverse", k=8, boundary="neumann", times=Times((2e4, 5e4), 0))
     progress = StudyProgress(1, quiet=True, stream=io.StringIO())

@@ -253,7 +253,8 @@ def test_a_filter_changes_only_blocks_with_a_vector_that_is_not_accurate():
         np.testing.assert_array_equal(found[8:], state.vectors[8:])
 
 
-@pytest.mark.parametrize("boundary", [pytest.param("mean", marks=pytest.mark.slow), "dirichlet"])
+@pytest.mark.slow
+@pytest.mark.parametrize("boundary", ["mean", "dirichlet"])
 def test_pairs_of_similar_tensors_are_a_start(rng, boundary):
     shape, k, told = (12, 11, 10), 16, []
     grid, tensors = hj.Grid(shape, 0.1, mask=masked(shape)), random_spd(rng, shape, 0.2)

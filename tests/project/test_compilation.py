@@ -62,6 +62,7 @@ def test_options_that_the_environment_sets_are_left_alone(flags):
         assert compilation._understood() == bool(hj.compiler_options()) == ours
 
 
+@pytest.mark.slow
 def test_public_options_change_no_value_and_no_gradient(flags):
     flags("")
     options = hj.compiler_options()

@@ -249,6 +249,7 @@ def constant(n, c=1.0):
     return hj.TensorField(hj.Grid((n, n)), np.broadcast_to(c * np.eye(2), (n, n, 2, 2)))
 
 
+@pytest.mark.slow
 def test_a_colouring_serves_no_times_beyond_those_planned():
     """Four times the metric and the time: heat reaches as many nodes as planned, but the degree is too small."""
     settings = hj.colouring(constant(24), [4.0], mass="lumped")
