@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from hks_jax.domain.grid import per_axis
 from hks_jax.io.tensor_order import Matrices, matrices, to_voxel_axes
-from hks_jax.io.units import UNITS, in_mm2_per_s, unit_in
+from hks_jax.io.units import in_mm2_per_s, unit_in, unknown_unit
 from hks_jax.io.volume import Format, TensorVolume, describe_tensors, mask_in_file, require_affine, spacing_of
 from hks_jax.storage import load_npy, load_npz, write_npz
 
@@ -78,7 +78,7 @@ def volume_of(name: str, arrays: Mapping[str, Any], tensors: Float[np.ndarray, "
         if affine is not None and affine.shape == (4, 4) and axis in (None, 0, 1, 2):
             spacing = spacing_of(affine, d, axis)
     if text and unit is None:
-        raise ValueError(f"{name}: unit: got {text!r}; expected one of {', '.join(UNITS)}")
+        raise ValueError(f"{name}: {unknown_unit(text)}")
     volume = TensorVolume(
         tensors,
         per_axis(f"{name}: spacing", spacing, d),

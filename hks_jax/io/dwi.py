@@ -15,7 +15,7 @@ from hks_jax.checks import require_number
 from hks_jax.io import nifti
 from hks_jax.io.masks import mask_on
 from hks_jax.io.tensor_order import Matrices, indices, pack, to_voxel_axes, unpack
-from hks_jax.io.units import MM2_PER_S, UNITS, Unit, b_value_question, median_mean_diffusivity
+from hks_jax.io.units import MM2_PER_S, UNITS, Unit, b_value_question, median_mean_diffusivity, unknown_unit
 from hks_jax.io.volume import TensorVolume, digest, placed
 from hks_jax.naming import argument
 from hks_jax.optional import optional
@@ -142,7 +142,7 @@ def fit_dwi(
     if b.min() < 0:
         raise ValueError(f"{os.fspath(bval)}: got the b-value {b.min():g}; expected numbers from 0")
     if unit not in (None, *UNITS):
-        raise ValueError(f"unit: got {unit!r}; expected one of {', '.join(UNITS)}")
+        raise ValueError(unknown_unit(unit))
     if b_max is not None:
         require_number("b_max", b_max, inclusive=True)
     if question := b_value_question(float(b.max()), unit or "mm2/s"):

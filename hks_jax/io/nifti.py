@@ -142,7 +142,7 @@ def _encoding(path: str) -> dict[str, Any]:
 
 
 class Declared(NamedTuple):
-    """What metadata of BIDS declare about tensors; None for what they do not declare."""
+    """The order, the axes and the unit of tensors that BIDS metadata declare; an undeclared entry is None."""
 
     order: Order | None
     frame: Frame | None
@@ -265,7 +265,7 @@ def siblings(path: str | os.PathLike[str]) -> list[str]:
 
 def described_by(paths: Sequence[str]) -> str:
     """Return the image whose sidecar describes the tensors: the only one, or that of xx among six components."""
-    return next((path for path in paths if len(paths) > 1 and component_of(path) == "xx"), paths[0])
+    return next((path for path in paths if component_of(path) == "xx"), paths[0])
 
 
 def read_components(paths: Sequence[str], order: str | None, frame: str | None) -> TensorVolume:

@@ -57,10 +57,15 @@ def unit_in(text: str) -> Unit | None:
     return next((unit for unit in get_args(Unit) if unit == word), None)
 
 
+def unknown_unit(got: object) -> str:
+    """Return the error's text for a unit of tensors that is not one of `UNITS`."""
+    return f"unit: got {got!r}; expected one of {', '.join(UNITS)}"
+
+
 def in_mm2_per_s(volume: TensorVolume, unit: Unit, why: str = "as asked") -> TensorVolume:
     """Return the volume with its tensors converted from `unit` to mm²/s; a note says why they have this unit."""
     if unit not in UNITS:
-        raise ValueError(f"unit: got {unit!r}; expected one of {', '.join(UNITS)}")
+        raise ValueError(unknown_unit(unit))
     if volume.unit:
         raise ValueError(
             f"unit: got {unit!r}, but {volume.source} declares its unit, and its numbers are in {volume.unit} now. "

@@ -33,7 +33,7 @@ class Colouring:
         low: the lower bound on the eigenvalues of D⁻¹M, where the diagonal matrix D holds the row sums of M.
         reach: `Bounds.reach` for each axis, times the longest time.
         across: `Bounds.across` for each axis.
-        shape: the numbers of nodes of the grid, for at most as many of which the sources' spacing is chosen.
+        shape: the shape of the grid; on a longer axis, sources of one colour would interfere.
         longest: the longest time, up to which the degree suffices on [0, `top`].
         error: for each time, a bound on the signature's error, including rounding errors, relative to the smaller of
             (4πt)^(−d/2) and the largest possible value at a node. For a lumped mass the bound holds unless `top` is too
