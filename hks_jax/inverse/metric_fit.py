@@ -20,7 +20,7 @@ _TOLERANCE, _STEPS = 1e-6, 1000
 """The relative residual of conjugate gradients, and the maximum number of their steps."""
 
 RESULTS = {
-    "converged": "the unknowns no longer change by more than the tolerance",
+    "converged": "the unknowns no longer change by more than the tolerance, or the residuals are rounding errors",
     "noise level reached": "the misfit is as small as the stated noise",
     "steps exhausted": "the number of steps reached max_steps; increase it",
     "stalled": "no step reduces the loss; change the damping, the regularisers or k",

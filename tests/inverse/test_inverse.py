@@ -180,6 +180,12 @@ def test_converged_means_the_unknowns():
     assert deviation < 3e-3
 
 
+def test_a_fit_that_starts_at_the_solution_has_converged():
+    fit = hj.fit_metric(CONFORMAL, signature(CONFORMAL), TIMES, "conformal", k=K)
+    assert fit.result == "converged"
+    assert len(fit.history) == 1
+
+
 @pytest.mark.slow
 def test_noise_stops_the_fit_where_it_explains_the_misfit(rng):
     target = signature(CONFORMAL) * np.exp(0.01 * rng.standard_normal((4, N, N)))
