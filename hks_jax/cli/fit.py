@@ -65,11 +65,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     options.add_conventions(
         parser.add_argument_group("meaning of the numbers in --init", "needed only if the file does not declare it.")
     )
-    parser.add_argument(
-        "--interpolation",
-        choices=("linear", "log-euclidean"),
-        help="the interpolation of the metric between nodes (default: the interpolation in TARGET, otherwise linear)",
-    )
+    options.add_interpolation(parser, None, "the interpolation in TARGET, otherwise linear")
     parser.add_argument(
         "--parametrisation",
         choices=("log-euclidean", "cholesky", "conformal", "eigenvalues", "rotation"),

@@ -189,14 +189,14 @@ def add_dtype(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_interpolation(parser: argparse.ArgumentParser) -> None:
-    """Add the interpolation of the metric."""
+def add_interpolation(parser: argparse.ArgumentParser, default: str | None = "linear", or_else: str = "") -> None:
+    """Add the interpolation of the metric; `or_else` describes the interpolation if the default is None."""
     parser.add_argument(
         "--interpolation",
         choices=("linear", "log-euclidean"),
-        default="linear",
-        help="interpolation of the metric between nodes: of its components (default), or of its logarithm, which "
-        "preserves volumes if tensors rotate",
+        default=default,
+        help="interpolation of the metric between nodes: linear, of its components, or log-euclidean, of its "
+        f"logarithm, which preserves volumes if tensors rotate (default: {default or or_else})",
     )
 
 

@@ -127,20 +127,6 @@ def _in_sidecar(path: str) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def _encoding(path: str) -> dict[str, Any]:
-    """Return the field OrientationEncoding of an image's sidecar, or an empty dictionary."""
-    encoding = _in_sidecar(path).get("OrientationEncoding")
-    if not isinstance(encoding, dict):
-        return {}
-    reference = encoding.get("Reference")
-    if reference is not None and not (isinstance(reference, str) and reference in _REFERENCES):
-        raise ValueError(
-            f"{sidecar_of(path)}: got the Reference {reference!r}; expected one of {', '.join(_REFERENCES)}. Edit or "
-            "remove it"
-        )
-    return encoding
-
-
 class Declared(NamedTuple):
     """The order, the axes and the unit of tensors that BIDS metadata declare; an undeclared entry is None."""
 
@@ -155,7 +141,20 @@ def declared_in(metadata: Mapping[str, Any]) -> Declared:
     encoding = encoding if isinstance(encoding, dict) else {}
     frame: Any = _REFERENCES.get(str(encoding.get("Reference")))
     unit = unit_in(units) if isinstance(units, str) else None
-    return Declared("fsl" if encoding.get("Type") == "tensor" else None, frame, unit)
+    return Declared("fsl" if encoding.get("Type") == "tensor" else None, frame, unit)  # FSL's: xx xy xz yy yz zz
+
+
+def _by_sidecar(path: str) -> Declared:
+    """Return what an image's sidecar declares; raise ValueError if its Reference is unknown."""
+    content = _in_sidecar(path)
+    encoding = content.get("OrientationEncoding")
+    reference = encoding.get("Reference") if isinstance(encoding, dict) else None
+    if reference is not None and not (isinstance(reference, str) and reference in _REFERENCES):
+        raise ValueError(
+            f"{sidecar_of(path)}: got the Reference {reference!r}; expected one of {', '.join(_REFERENCES)}. Edit or "
+            "remove it"
+        )
+    return declared_in(content)
 
 
 def with_units(volume: TensorVolume, path: str, unit: Unit | None) -> TensorVolume:
@@ -163,10 +162,10 @@ def with_units(volume: TensorVolume, path: str, unit: Unit | None) -> TensorVolu
 
     The sidecar may describe an earlier image of the same name, so the unit in the image's own record counts first.
     """
-    text = _in_sidecar(path).get("Units") if is_nifti(path) and not volume.unit else None
+    content = _in_sidecar(path) if is_nifti(path) and not volume.unit else {}
+    text, declared = content.get("Units"), declared_in(content).unit
     if not isinstance(text, str):
         return volume if unit is None else in_mm2_per_s(volume, unit)
-    declared = unit_in(text)
     if declared is not None and unit in (None, declared):
         return in_mm2_per_s(volume, declared, "which the sidecar declares")
     if unit is None:
@@ -205,18 +204,16 @@ def _tensors_of(name: str, image: Any, voxels: np.ndarray, order: str | None, fr
         )
     declared = int(image.header["intent_code"]) == SYMMETRIC_MATRIX
     affine, length_unit = affine_in_mm(name, image)
-    encoding, record, notes = _encoding(name), _own_record(image, affine) if declared else {}, list[str]()
-    by_bids = "fsl" if encoding.get("Type") == "tensor" else ""  # BIDS has FSL's order, xx xy xz yy yz zz
-    found = matrices(name, voxels.reshape(*shape[:3], 6), order, "nifti" if declared else by_bids)
+    by_sidecar, record, notes = _by_sidecar(name), _own_record(image, affine) if declared else {}, list[str]()
+    found = matrices(name, voxels.reshape(*shape[:3], 6), order, "nifti" if declared else by_sidecar.order or "")
     if declared and found.order != "nifti":
         notes.append(f'components read in order "{order}", as asked; the file declares NIfTI\'s symmetric-matrix order')
-    by_sidecar = _REFERENCES.get(encoding.get("Reference", ""))
-    declared_frame = record.get("frame", by_sidecar)
+    declared_frame = record.get("frame", by_sidecar.frame)
     if declared_frame not in (None, "voxel", "fsl", "world"):
         raise ValueError(f'{name}: the header declares {declared_frame!r} axes; expected "voxel", "fsl" or "world"')
-    if by_sidecar not in (None, declared_frame):  # the sidecar may describe an earlier image of the same name
+    if by_sidecar.frame not in (None, declared_frame):  # the sidecar may describe an earlier image of the same name
         notes.append(
-            f"the {by_sidecar} axes of the sidecar are ignored, because the image declares {declared_frame} axes"
+            f"the {by_sidecar.frame} axes of the sidecar are ignored, because the image declares {declared_frame} axes"
         )
     open_frame = frame is None and declared_frame is None and found.order == "nifti"
     if frame is not None and declared_frame not in (None, frame):
