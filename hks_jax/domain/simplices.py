@@ -10,10 +10,14 @@ from jaxtyping import Bool, Float, Int
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import require_static
 from hks_jax.domain.components import as_mask
+from hks_jax.domain.tensor_checks import lost_determinants
 from hks_jax.domain.triangulation import Triangulation
 
 _FLAT = 1e-10
 """A simplex is degenerate if d! times its volume is at most this number times the d-th power of its longest edge."""
+_THIN = 10
+"""A simplex is thin if rounding may spoil its metric: if the metric's determinant, relative to the longest edge, is
+below this number times ε."""
 _ON_EDGE = 1e-6
 """A vertex is on an edge if its distance from the edge is at most this fraction of the edge's length."""
 
@@ -171,17 +175,35 @@ def _warn_of_pinched(triangulation: Triangulation) -> None:
         )
 
 
-def check_metric(metric: Float[np.ndarray, "n d d"], cells: Int[np.ndarray, "n corners"]) -> None:
-    """Raise ValueError if the induced metric of a simplex is NaN, because rounding exceeds the simplex's height."""
-    thin = np.isnan(metric).any(axis=(1, 2))
-    if not thin.any():
-        return
-    first, words = int(np.argmax(thin)), WORDS[cells.shape[1] - 1]
-    raise ValueError(
-        f"{words.argument}: {int(thin.sum())} of {len(cells)} {words.simplices} are so thin that their metric is lost "
-        f"to rounding in {metric.dtype} (the first is {words.one} {first}, vertices {cells[first].tolist()}); merge or "
-        f"move their vertices{', or use float64' * (metric.dtype != np.float64)}"
-    )
+def check_metric(
+    metric: Float[np.ndarray, "n d d"], vertices: Float[np.ndarray, "V 3"], cells: Int[np.ndarray, "n corners"]
+) -> None:
+    """Raise ValueError if rounding, underflow or overflow spoils the induced metric of a simplex at these vertices."""
+    words, dtype = WORDS[cells.shape[1] - 1], metric.dtype
+    positions = vertices.astype(np.float64)
+    edges = positions[cells[:, 1:]] - positions[cells[:, :1]]
+    longest = np.abs(edges).max(axis=(1, 2), keepdims=True)
+    shape = edges / longest
+    thin = np.linalg.det(shape @ np.swapaxes(shape, 1, 2)) < _THIN * np.finfo(dtype).eps
+    with np.errstate(over="ignore"):
+        lost, digits = lost_determinants(edges @ np.swapaxes(edges, 1, 2), dtype)
+    of_unit, wrong = lost & ~thin, np.isnan(metric).any(axis=(1, 2))
+    remedy = ", or use float64" * (dtype != np.float64)
+    if of_unit.any():
+        first = int(np.argmax(of_unit))
+        raise ValueError(
+            f"vertices: {int(of_unit.sum())} of {len(cells)} {words.simplices} are so small or large that the "
+            f"determinant of their metric, about 1e{digits[first]:.0f}, is beyond the accurate range of {dtype} (the "
+            f"first is {words.one} {first}, with edges of about {longest[first, 0, 0]:.1g}). Use a unit of length in "
+            f"which edges are near 1{remedy}"
+        )
+    if wrong.any():
+        first = int(np.argmax(wrong))
+        raise ValueError(
+            f"{words.argument}: {int(wrong.sum())} of {len(cells)} {words.simplices} are so thin that their metric is "
+            f"lost to rounding in {dtype} (the first is {words.one} {first}, vertices {cells[first].tolist()}); merge "
+            f"or move their vertices{remedy}"
+        )
 
 
 def _check_once(faces: Int[np.ndarray, "F 3"]) -> None:

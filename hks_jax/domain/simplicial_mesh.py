@@ -54,7 +54,7 @@ class SimplicialMesh(eqx.Module):
             check_places(np.asarray(positions, np.float64), triangulation, whole=mask is None)
         self._metric = None if metric is None else _checked_metric(self.restrict(metric), triangulation)
         if metric is None and not is_traced(positions):
-            check_metric(np.asarray(self.metric), triangulation.cells)
+            check_metric(np.asarray(self.metric), np.asarray(positions), triangulation.cells)
 
     @classmethod
     def from_tensors(

@@ -103,14 +103,29 @@ def require_spd(
                 f"metric by hks_jax.TensorField.from_indefinite. {_MASK}, if they are outside the domain"
             )
         refuse_tensors(name, bad, inside, place, what, of_grids if place == "node" else "Raise their eigenvalues")
-    # The determinant is computed in the dtype of the tensors, where it may underflow to 0 or overflow.
-    d, limits = tensors.shape[-1], np.finfo(tensors.dtype if tensors.dtype.kind == "f" else np.float64)
-    with np.errstate(divide="ignore", invalid="ignore"):  # outside the mask
-        digits = np.log10(spd.determinant(scaled.astype(np.float64))) + d * np.log10(size.astype(np.float64))
-    bad = inside & ~((digits > np.log10(limits.tiny)) & (digits < np.log10(limits.max)))
+    bad, digits = lost_determinants(tensors, tensors.dtype if tensors.dtype.kind == "f" else np.dtype(np.float64))
+    bad &= inside
     if bad.any():
-        what = f"so small or large that their determinant, about 1e{digits[bad][0]:.0f}, is not a {limits.dtype} number"
+        about = f"about 1e{digits[bad][0]:.0f}, is beyond the accurate range of {tensors.dtype}"
+        what = f"so small or large that their determinant, {about}"
         refuse_tensors(name, bad, inside, place, what, "Use another unit, in which the eigenvalues are near 1")
+
+
+# Determinants are computed in the dtype of the tensors. XLA rounds numbers below the least normal one to zero, so such
+# terms of a determinant are small enough only relative to a determinant that is larger by 1/ε. The terms have the order
+# of the product of the largest entries, also if the determinant is much smaller.
+def lost_determinants(
+    tensors: Float[np.ndarray, "*shape d d"], dtype: np.dtype
+) -> tuple[Bool[np.ndarray, "*shape"], Float[np.ndarray, "*shape"]]:
+    """Mark positive definite tensors whose determinant underflows or overflows, and return its decimal logarithm."""
+    d, limits = tensors.shape[-1], np.finfo(dtype)
+    size = np.abs(tensors).max(axis=(-2, -1)).astype(np.float64)
+    scaled = tensors.astype(np.float64) / np.where(size > 0, size, 1)[..., None, None]
+    with np.errstate(divide="ignore", invalid="ignore"):  # outside the mask
+        terms = d * np.log10(size)
+        digits = np.log10(spd.determinant(scaled)) + terms
+        lowest, highest = np.log10(limits.tiny) - np.log10(limits.eps), np.log10(limits.max) - 1
+        return ~((digits > lowest) & (terms < highest)), digits
 
 
 def require_finite_symmetric(

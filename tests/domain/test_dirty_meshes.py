@@ -186,6 +186,23 @@ def test_what_float32_does_not_resolve_is_fine_in_float64():
         hj.SurfaceMesh(vertices.astype(np.float32), faces)
 
 
+@pytest.mark.parametrize(
+    ("mesh", "least", "largest"),
+    [(hj.examples.ball_mesh(2), 1e-4, 1e6), (hj.examples.sphere_mesh(3), 1e-7, 1e8)],
+)
+def test_a_unit_of_length_beyond_float32_is_refused_and_every_other_one_is_as_good(mesh, least, largest):
+    def scaled(unit):
+        vertices = (unit * np.asarray(mesh.vertices)).astype(np.float32)
+        return type(mesh)(vertices, mesh.triangulation.cells)
+
+    expected = eigenvalues(mesh, 4)
+    for unit in (least, largest):
+        np.testing.assert_allclose(eigenvalues(scaled(unit), 4) * unit**2, expected, atol=1e-5 * expected.max())
+    for unit in (least**2, largest**2):
+        with pytest.raises(ValueError, match=r"beyond the accurate range of float32 .* near 1, or use float64"):
+            scaled(unit)
+
+
 # ---------------------------------------------------------------------------------------------- what is torn
 
 
