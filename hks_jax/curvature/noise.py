@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from math import comb
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -59,7 +60,8 @@ def warn_of_errors(
         wraps: whether each axis is periodic.
         differences: the order of the differences that show the noise. It must exceed the order of the derivatives.
     """
-    if field.function is not None or is_traced((field, list(values))):
+    field, values = jax.lax.stop_gradient((field, list(values)))
+    if field.function is not None or is_traced((field, values)):
         return
     tensors = np.asarray(field.domain_tensors)
     precision, d = float(np.finfo(tensors.dtype).eps), field.grid.dimension

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from hks_jax.checks import require_number
+from hks_jax.checks import require_number, require_static
 from hks_jax.domain.components import active_elements, wraps_per_axis
 from hks_jax.domain.tensor_field import TensorField, require_field
 
@@ -72,6 +72,7 @@ def degenerate_points(
         DegeneratePoints(positions=array([[0., 0.]]), indices=array([0.5]))
     """
     require_field(field)
+    require_static("field", field)
     grid = field.grid
     if grid.dimension != 2:
         raise ValueError(

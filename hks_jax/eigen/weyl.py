@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from hks_jax.checks import require_real
+from hks_jax.checks import require_real, require_static
 from hks_jax.domain.components import wrap_nodes
 from hks_jax.domain.simplicial_mesh import SimplicialMesh
 from hks_jax.domain.tensor_field import TensorField
@@ -63,6 +63,8 @@ def weyl_count(
         raise ValueError("problem: got matrices without dimension or volume; give `sparse_pencil` both numbers")
     if any(part.has_potential for part in pencil.parts):
         raise ValueError("problem: got an operator with a potential, which Weyl's law omits; use `count_eigenvalues`")
+    require_static("values", values)
+    require_static("problem", volume)
     require_real("values", values)
     numbers = np.asarray(values, np.float64)
     if not (np.isfinite(numbers) & (numbers >= 0)).all():

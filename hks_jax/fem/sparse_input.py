@@ -112,12 +112,18 @@ def pencil_of(domain: Any, boundary: BoundarySpec, mass: MassKind, quadrature: Q
         domain = sparse_pencil(*domain) if isinstance(domain, tuple) else sparse_pencil(domain)
     if isinstance(domain, Pencil) and isinstance(domain.space, MatrixSpace):
         matrices = domain.stiffness, domain.mass
+        _require_equal_dtypes(domain.mass.dtype, domain.stiffness.dtype)
         symmetric = [m.symmetric_part() if isinstance(m, SparseOperator) else m for m in matrices]
         domain = eqx.tree_at(lambda p: (p.stiffness, p.mass), domain, symmetric)
     for part in jax.lax.stop_gradient(domain).parts:
         require_null_space(part)
         _require_definite_mass(part)
     return domain
+
+
+def _require_equal_dtypes(of_mass: np.dtype, of_stiffness: np.dtype) -> None:
+    if of_mass != of_stiffness:
+        raise ValueError(f"M: got {of_mass}; expected {of_stiffness}, the dtype of K. Convert one of them with .astype")
 
 
 def _require_definite_mass(pencil: Pencil) -> None:
@@ -197,8 +203,7 @@ def _pencil(K: Any, M: Any) -> SymmetricPencil:
         else:
             matrices.append(mass)
     given = matrices[-1].values.dtype if diagonal is None else diagonal.dtype
-    if given != dtype:
-        raise ValueError(f"M: got {given}; expected {dtype}, the dtype of K. Convert one of them with .astype")
+    _require_equal_dtypes(given, dtype)
     if diagonal is not None and not is_traced(diagonal):
         wrong = np.flatnonzero(~(np.asarray(diagonal) > 0))
         if wrong.size:

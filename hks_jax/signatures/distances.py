@@ -189,7 +189,7 @@ def varadhan_distance(
     relative = kernel / jnp.sqrt(jnp.where(scale > 0, scale, 1))
 
     by_pairs, by_grid = _least_kernels(pairs, times, nodes)
-    _warn_of_distance(pairs, times, relative, by_pairs, by_grid)
+    _warn_of_distance(pairs, times, nodes, relative, by_pairs, by_grid)
     defined = relative > jnp.maximum(by_pairs, by_grid)
     if normalised:
         # At distance zero, rounding may change the kernel, and √ has no derivative, so the distance is set to zero.
@@ -237,16 +237,27 @@ def _least_kernels(
 
 
 def _warn_of_distance(
-    pairs: Eigenpairs, times: Float[Array, " m"], relative: Array, by_pairs: Array, by_grid: Array
+    pairs: Eigenpairs,
+    times: Float[Array, " m"],
+    nodes: Int[np.ndarray, " s"],
+    relative: Array,
+    by_pairs: Array,
+    by_grid: Array,
 ) -> None:
-    relative, by_pairs, by_grid = jax.lax.stop_gradient((relative, by_pairs, by_grid))
-    if is_traced((relative, by_pairs, by_grid)):
+    times, relative, by_pairs, by_grid = jax.lax.stop_gradient((times, relative, by_pairs, by_grid))
+    if is_traced((times, relative, by_pairs, by_grid)):
         return
-    free = pairs.space.free
-    too_small = ~np.asarray(relative > by_pairs)[..., free]
-    far = too_small | ~np.asarray(relative > by_grid)[..., free]
+    free, labels = pairs.space.free, pairs.space.labels
+    connected = labels[free] == labels.ravel()[nodes][:, None]
+    if apart := int((~connected).sum()):
+        warn_of_accuracy(
+            f"sources: {apart / connected.size:.1%} of the distances are NaN, because source and node are in different "
+            "components of the domain, between which the distance is infinite"
+        )
+    too_small = ~np.asarray(relative > by_pairs)[..., free][:, connected]
+    far = too_small | ~np.asarray(relative > by_grid)[..., free][:, connected]
     if far.any():
-        worst = int(np.argmax(far.mean(axis=(1, 2))))
+        worst = int(np.argmax(far.mean(axis=1)))
         remedy = "more eigenpairs (in float64)" if 2 * too_small.sum() >= far.sum() else "a finer grid"
         warn_of_accuracy(
             f"times: {far.mean():.1%} of the distances are NaN ({far[worst].mean():.1%} at t = "

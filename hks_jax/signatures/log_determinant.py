@@ -167,9 +167,10 @@ def log_determinant(
     errors = jax.lax.stop_gradient(rest + jnp.where(jnp.isfinite(bias), bias, 0))
     best = jnp.argmin(jnp.where(jnp.isfinite(errors), errors, jnp.inf))
     result = LogDeterminant(levels[0][best], errors[best], times[best])
-    if not is_traced(result) and not float(result.error) <= _DOUBTFUL:
+    known = jax.lax.stop_gradient(result)
+    if not is_traced(known) and not float(known.error) <= _DOUBTFUL:
         warn_of_accuracy(
-            f"pairs: log det′ = {float(result.value):.4g} has the estimated error {float(result.error):.2g}. Use a "
+            f"pairs: log det′ = {float(known.value):.4g} has the estimated error {float(known.error):.2g}. Use a "
             "finer grid, more pairs or more coefficients, or list the next powers of t in `extrapolate`"
         )
     return result

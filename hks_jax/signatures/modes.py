@@ -310,8 +310,9 @@ def _given(
     leading = u.shape[: u.ndim - len(shape)]
     rows = space.restrict(u.reshape(-1, *shape))
     if is_traced(rows):
-        measured = jnp.all(~jnp.isnan(rows[:1]), axis=0)
-        return jnp.where(measured[None], rows, 0), leading, measured
+        unmeasured = jnp.isnan(rows)
+        other = jnp.any(unmeasured != unmeasured[:1], axis=1, keepdims=True)  # refused if values are concrete
+        return jnp.where(other, jnp.nan, jnp.where(unmeasured[:1], 0, rows)), leading, ~unmeasured[0]
     known = np.asarray(rows)
     if infinite := int(np.isinf(known).sum()):
         raise ValueError(f"f: got {infinite} infinite values inside the mask; expected finite values, or NaN")

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from hks_jax.checks import require_number, require_real
+from hks_jax.checks import require_number, require_real, require_static
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +51,9 @@ def region_statistics(values: Any, labels: Any, node_volume: float = 1.0) -> Reg
         >>> hj.region_statistics(labels[None].astype(float), labels).mean
         array([[1., 2.]])
     """
-    require_real("values", values)
-    require_real("labels", labels)
+    for name, given in (("values", values), ("labels", labels)):
+        require_static(name, given)
+        require_real(name, given)
     require_number("node_volume", node_volume)
     u, regions = np.asarray(values, np.float64), np.asarray(labels)
     if u.ndim < 2 or u.shape[1:] != regions.shape:

@@ -148,11 +148,13 @@ def _nan_if_lost(
     scale: Float[Array, " m"],
 ) -> Float[Array, "m *shape"]:
     """Return the signature, with NaN at times at which errors may exceed a few per cent of the largest value."""
+    known_times = jax.lax.stop_gradient(times)
     lost = _lost(settings, *jax.lax.stop_gradient((values, pencil.parts, times, scale)))
     if not is_traced(lost) and lost.any():
+        first = float(known_times[lost][0])
         warn_of_accuracy(
-            f"times: the signatures at {int(lost.sum())} of {times.size} times, the first {float(times[lost][0]):.4g}, "
-            f"are NaN, because errors in {times.dtype} may exceed a few per cent. Relative errors grow with t, in "
+            f"times: the signatures at {int(lost.sum())} of {times.size} times, the first {first:.4g}, are NaN, "
+            f"because errors in {times.dtype} may exceed a few per cent. Relative errors grow with t, in "
             "particular if the lowest eigenvalue is far above zero or above a potential's least value. Use eigenpairs "
             "or smaller times"
         )
@@ -228,6 +230,7 @@ def _excess(
 
 
 def _warn_of_misfit(settings: Colouring, times: Float[Array, " m"], late: float, growth: float, coupled: float) -> None:
+    times = jax.lax.stop_gradient(times)
     if late > _ROUNDED:
         warn_of_accuracy(
             f"method: got a Colouring for times up to {settings.longest:.4g}; expected one for times up to "

@@ -189,6 +189,8 @@ def test_only_a_grid_that_does_not_resolve_the_metric_is_told():
     coarse, fine = nodal(examples.sphere_field(21)), nodal(examples.sphere_field(121))
     with pytest.warns(hj.AccuracyWarning, match="coefficient u1 of the expansion is not resolved"):
         hj.hks_expansion(coarse, [1.0], 1)
+    with pytest.warns(hj.AccuracyWarning, match="Gaussian curvature is not resolved"):
+        jax.grad(lambda T: hj.gaussian_curvature(hj.TensorField(coarse.grid, T)).sum())(coarse.tensors)
     np.testing.assert_allclose(hj.gaussian_curvature(fine), 1, atol=0.1)
     hj.gaussian_curvature(nodal(examples.torus_field((12, 24), R, r)), periodic=True)
     hj.gaussian_curvature(hj.TensorField(hj.Grid((9, 9)), np.broadcast_to(np.diag([1.0, 4.0]), (9, 9, 2, 2))))  # flat

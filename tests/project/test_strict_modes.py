@@ -42,6 +42,10 @@ def test_traced_arguments_that_must_be_static_are_named():
         "faces": (lambda x: hj.SurfaceMesh(vertices, x), faces),
         "k": (lambda x: hj.eigenpairs(hj.TensorField(hj.Grid((4, 4)), tensors), x), 3),
         "sources": (lambda x: hj.heat_kernel(known, [4.0], x), np.array([4, 4])),
+        "field": (lambda x: hj.degenerate_points(hj.TensorField(hj.Grid((4, 4)), x)), tensors),
+        "labels": (lambda x: hj.region_statistics(np.ones((1, 4, 4)), x), np.ones((4, 4), int)),
+        "values": (lambda x: hj.weyl_count(known, x), np.ones(1)),
+        "problem": (lambda x: hj.weyl_count(hj.assemble(hj.TensorField(hj.Grid((4, 4)), x)), [1.0]), tensors),
         "width": (lambda x: hj.reflect(hj.TensorField(hj.Grid((4, 4)), tensors), x), 2),
     }
     for name, (call, value) in calls.items():

@@ -265,6 +265,8 @@ def test_a_colouring_serves_no_times_beyond_those_planned():
     with pytest.warns(hj.AccuracyWarning, match=r"method: got a Colouring for times up to 4; .* up to 16, .*all times"):
         found = hj.hks_spectrum_free(constant(24, 4.0), [16.0], mass="lumped", method=settings)
     assert np.isnan(found).all()
+    with pytest.warns(hj.AccuracyWarning, match="for times up to 4; .* up to 16, "):
+        jax.grad(lambda t: signature.__wrapped__(4.0, t)[0, 0, 0])(jnp.array([16.0]))
 
 
 def test_a_colouring_serves_no_larger_grid():
@@ -329,6 +331,10 @@ def test_amplified_errors_give_nan(method):
     # With Dirichlet conditions the signature at t = 5 is 1e-25, far below the error.
     with pytest.warns(hj.AccuracyWarning, match="the signatures at 1 of 2 times, the first 5, are NaN"):
         found = hj.hks_spectrum_free(field, [0.2, 5.0], "dirichlet", "lumped", method)
+    with pytest.warns(hj.AccuracyWarning, match="the signatures at 1 of 2 times, the first 5, are NaN"):
+        jax.grad(lambda t: jnp.nansum(hj.hks_spectrum_free(field, t, "dirichlet", "lumped", method)))(
+            jnp.array([0.2, 5.0])
+        )
     # The lowest eigenvalue is 6 % too small, which makes 14 % of the signature at λt = 2.4.
     with pytest.warns(hj.AccuracyWarning, match="between Dirichlet sides, few modes remain"):
         exact = hj.hks(hj.eigenpairs(field, 30, "dirichlet", "dense", "lumped"), [0.2])[0]

@@ -120,6 +120,21 @@ def test_scaling_batches_jit_and_dirichlet_sides():
         hj.varadhan_distance(pairs, times, (0, 4))
 
 
+def test_distances_that_are_nan_are_told_with_their_cause():
+    mask = np.ones((9, 9), bool)
+    mask[:, 4] = False
+    apart = hj.TensorField(hj.Grid((9, 9), mask=mask, components="all"), np.tile(np.eye(2), (9, 9, 1, 1)))
+    pairs = hj.eigenpairs(apart, 72, solver="dense", multiplet="drop")
+    with pytest.warns(hj.AccuracyWarning) as told:
+        distance = hj.varadhan_distance(pairs, [40.0], (4, 1))[0, 0]
+    assert [str(each.message).split(" of the")[0] for each in told] == ["sources: 50.0%"]
+    assert np.isfinite(distance[:, :4]).all()
+    assert np.isnan(distance[:, 4:]).all()
+    with pytest.warns(hj.AccuracyWarning) as told:
+        jax.grad(lambda t: jnp.nansum(hj.varadhan_distance(pairs, t, (4, 1))[..., :4]))(jnp.array([0.5]))
+    assert [str(each.message).split(":")[0] for each in told] == ["sources", "times"]
+
+
 # --- a tunnel ---------------------------------------------------------------------------------------------------------
 
 SHAPE, WALL = (37, 27), slice(10, 17)
