@@ -71,7 +71,8 @@ class Reading:
         """The second scan, if ``--noise`` names a file, or else None."""
         if self.noise is None or not is_file(self.noise):
             return None
-        return replace(self, file=Path(self.noise), others=(), noise=None)
+        tensors = replace(self, bval=None, bvec=None, bvec_frame=None, b_max=None)
+        return replace(tensors, file=Path(self.noise), others=(), noise=None)
 
     @property
     def files(self) -> dict[str, list[str]]:
@@ -107,8 +108,9 @@ def read_volume(reading: Reading, progress: Progress) -> TensorVolume:
     require_metric(reading, volume)
     if 1 in volume.shape:
         raise ValueError(f"--slice: the volume is one voxel thick. Pass --slice {'xyz'[volume.shape.index(1)]}=0")
-    if lost := int(without_element(volume).sum()):
-        progress.note(outside_note(lost))
+    if (lost := without_element(volume)).any():
+        progress.note(note := outside_note(int(lost.sum())))
+        volume = replace(volume.with_mask(volume.inside & ~lost), notes=(*volume.notes, note))
     require_valid(volume.with_mask(volume.grid(reading.components).mask), "--repair")
     return volume
 

@@ -57,4 +57,4 @@ def _spaced(pairs: Eigenpairs, first: Array, product: float, n: int) -> Float[Ar
     """Return times from `first` to the end that the boundary, or the given product λ₁t, permits."""
     end = jnp.maximum(first, product / positive_range(pairs)[0])
     free = half_free(pairs, first, end).astype(first.dtype)
-    return jnp.geomspace(first, jnp.minimum(end, jnp.maximum(free, SHORTEST * first)), n)
+    return jnp.geomspace(first, jnp.maximum(jnp.minimum(end, free), SHORTEST * first), n)

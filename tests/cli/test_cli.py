@@ -24,6 +24,7 @@ from hks_jax.cli import outputs as outputs_module
 from hks_jax.cli.inputs import INPUTS
 from hks_jax.cli.parsing import Times, boundary_conditions, parse_times
 from hks_jax.cli.progress import Progress, bar, duration
+from hks_jax.cli.reading import Reading
 from hks_jax.eigen.solver import Status
 from hks_jax.fem.boundary import default_boundary
 from hks_jax.inverse.metric_fit import RESULTS
@@ -900,6 +901,14 @@ def test_fit_errors_are_one_line_and_leave_nothing(conformal, tmp_path, capsys, 
     before = sorted(tmp_path.iterdir())
     assert one_error(capsys, main(["fit", "target.npz", "-o", "out", *arguments]), *words) == 2
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_second_scan_beside_images_is_a_file_of_tensors():
+    words = ["hks", "dwi.nii.gz", "--bval", "a.bval", "--bvec", "a.bvec", "--b-max", "1200"]
+    words += ["--noise", "second.nii.gz", "-o", "out"]
+    second = Reading.of(build_parser().parse_args(words)).second_scan
+    assert second.file == Path("second.nii.gz")
+    assert (second.bval, second.bvec, second.bvec_frame, second.b_max, second.noise) == (None,) * 5
 
 
 @pytest.mark.slow

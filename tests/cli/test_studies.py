@@ -722,7 +722,9 @@ def test_a_study_has_errors_of_regions_and_computes_again_what_had_other_noise(s
         "hks_jax.cli.study.tasks.signature_panels", lambda result, path, **_: path.write_text("picture")
     )
     head, first, _, third = (study / "subjects.tsv").read_text().splitlines()
-    (study / "subjects.tsv").write_text(f"{head}\tnoise\n{first}\tsecond.nii.gz\n{third}\t\n")
+    labels = "atlas_dseg.nii.gz"
+    subjects = f"{head}\tnoise\tatlas\n{first}\tsecond.nii.gz\t{{}}\n{third}\t\t{labels}\n"
+    (study / "subjects.tsv").write_text(subjects.format(labels))
 
     def scan_again():
         other = tensors() * (1 + 0.04 * rng.standard_normal((*SHAPE, 1, 1)))
@@ -732,6 +734,7 @@ def test_a_study_has_errors_of_regions_and_computes_again_what_had_other_noise(s
 
     scan_again()
     words = command(study, "out", "--times", "3e3", "6e3", "--noise", "0.01", "--draws", "8", "--save-pairs")
+    del words[(at := words.index("--atlas")) : at + 2]  # the table has the atlases
     assert main(words) == 0
     rows = table(study / "out" / "group_regions.tsv")
     stem = study / "out" / "sub-01" / "dwi" / "sub-01_model-tensor_param-hks"
@@ -753,6 +756,11 @@ def test_a_study_has_errors_of_regions_and_computes_again_what_had_other_noise(s
     assert "1 of 2 subjects are already done" in capsys.readouterr().err
     changed = {name for name, content in contents(study / "out").items() if before[name] != content}
     assert {name.split("/")[0] for name in changed} == {"sub-01", "group_regions.tsv"}
+    (study / "subjects.tsv").write_text(subjects.format("n/a"))
+    assert main(words) == 0  # one subject has no atlas any more
+    assert "2 of 2 subjects are already done" in capsys.readouterr().err
+    assert {row["participant_id"] for row in table(study / "out" / "group_regions.tsv")} == {"sub-03"}
+    assert not list((study / "out" / "sub-01").rglob("*regions*"))
     for more, text in (
         (["--noise", "second.nii.gz"], "a column named noise"),
         (["--method", "auto"], "expected spectral"),

@@ -2,6 +2,7 @@
 
 import base64
 import gzip
+import json
 
 import numpy as np
 import pytest
@@ -106,7 +107,13 @@ def test_voxels_without_an_element_are_counted(tmp_path, capsys):
     mask[:4], mask[6, 3, 2] = True, True
     np.savez(tmp_path / "t.npz", tensors=np.broadcast_to(np.eye(3), (7, 4, 3, 3, 3)), mask=mask)
     assert main(["hks", str(tmp_path / "t.npz"), "-o", str(tmp_path / "out"), "-k", "4", "--times", "1"]) == 0
-    assert "1 voxels of the mask are left out, because they belong to no element" in capsys.readouterr().err
+    note = "1 voxels of the mask are left out, because they belong to no element"
+    assert note in capsys.readouterr().err
+    about = json.loads((tmp_path / "out" / "report.json").read_text())["input"]
+    assert about["voxels_inside"] == 48
+    assert about["notes"][-1].startswith(note)
+    with np.load(tmp_path / "out" / "hks.npz") as saved:
+        np.testing.assert_array_equal(saved["mask"], np.isfinite(saved["hks"][0]))
 
 
 # ---------------------------------------------------------------------------------------------------- surfaces

@@ -166,6 +166,11 @@ class Study:
                 if _TEMPORARY.fullmatch(left.name):
                     shutil.rmtree(left) if left.is_dir() else left.unlink()
 
+    def forget_regions(self, subject: Subject) -> None:
+        """Remove the table of a subject's regions."""
+        for suffix in (".json", ".tsv"):  # the sidecar first, because it marks completion
+            self.path(subject, f"{REGIONS}{suffix}").unlink(missing_ok=True)
+
     @property
     def record(self) -> dict[str, Any]:
         """The settings that all subjects share, as stored in study.json."""

@@ -34,7 +34,7 @@ def write_group(study: Study, subjects: list[Subject], problems: Mapping[str, st
     """Write the tables of all participants, all subjects and all regions, and return their paths.
 
     `problems` maps the names of subjects without a result to the reason, which begins with `FAILED` if the computation
-    failed. The regions are those of all subjects that have a table of regions, which belongs to their signature.
+    failed. The regions are those of all subjects with an atlas and a table of regions, which belongs to the signature.
     """
     entities = list(dict.fromkeys(entity for subject in subjects for entity in subject.entities))
     head, ids = [_COLUMNS.get(entity, entity) for entity in entities], {}
@@ -45,7 +45,8 @@ def write_group(study: Study, subjects: list[Subject], problems: Mapping[str, st
     summary = [(*ids[s.name], *_summary(study.path(s, f"{MAP}.json"), problems.get(s.name))) for s in subjects]
     about = {name: {"Description": text} for name, text in SUMMARY.items()}
     files += write_table(study.folder / "group_summary.tsv", (*head, *SUMMARY), summary, about)
-    done = [s for s in subjects if s.name not in problems and study.path(s, f"{REGIONS}.json").is_file()]
+    done = [s for s in subjects if s.name not in problems and s.args.atlas is not None]
+    done = [s for s in done if study.path(s, f"{REGIONS}.json").is_file()]
     joint = study.folder / "group_regions.tsv"
     if not done:
         for old in (joint.with_suffix(".json"), joint):

@@ -166,6 +166,8 @@ def run_all(study: Study, subjects: list[Subject], progress: StudyProgress, debu
     for subject in subjects:
         try:
             task = _Task.of(study, subject)
+            if not task.regions:
+                study.forget_regions(subject)
             lacking = task.lacking()
         except Exception as error:
             failed(subject, error)
@@ -231,11 +233,10 @@ class _Task(NamedTuple):
             result = _compute(study, subject, self.fingerprint, progress)  # removes the picture and table of regions
             lacking = (REGIONS, PICTURE)
         if REGIONS in lacking and self.regions:
-            table = study.path(subject, f"{REGIONS}.tsv")
-            for old in (table.with_suffix(".json"), table):  # the sidecar first, because it marks completion
-                old.unlink(missing_ok=True)
+            study.forget_regions(subject)
             with progress.stage("regions"):
-                source, args = study.path(subject, f"{MAP}.npz"), subject.args
+                table, source = study.path(subject, f"{REGIONS}.tsv"), study.path(subject, f"{MAP}.npz")
+                args = subject.args
                 columns, rows, about = region_table(source, args.atlas, args.names, progress)
                 write_table(table, columns, rows)
                 checked = {"Fingerprint": self.regions, "SHA256": {table.name: digest(table)}}
