@@ -27,26 +27,17 @@ def energy(grid):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("shape", "isotropic"),
-    [
-        ((4, 5), True),
-        ((4, 5), False),
-        ((3, 4, 3), True),
-        ((3, 4, 3), False),
-    ],
-)
-def test_gradient_agrees_with_differences(rng, shape, isotropic):
+@pytest.mark.parametrize("shape", [(4, 5), (3, 4, 3)])
+def test_gradient_agrees_with_differences(rng, shape):
     d = len(shape)
-    tensors = jnp.broadcast_to(2 * jnp.eye(d), (*shape, d, d)) if isotropic else jnp.asarray(random_spd(rng, shape))
-    direction = rng.standard_normal(tensors.shape)
-    direction = jnp.asarray(0.1 * (direction + np.swapaxes(direction, -1, -2)))
     value = jax.jit(energy(hj.Grid(shape)))
-    gradient = jax.jit(jax.grad(value))(tensors)
-    expected = float(directional(value, tensors, direction))
-    assert jnp.vdot(gradient, direction) == pytest.approx(expected, rel=1e-8)
-    forward = jax.jit(lambda T: jax.jvp(value, (T,), (direction,))[1])(tensors)
-    assert forward == pytest.approx(expected, rel=1e-8)
+    gradient, forward = jax.jit(jax.grad(value)), jax.jit(lambda T, change: jax.jvp(value, (T,), (change,))[1])
+    for tensors in (jnp.broadcast_to(2 * jnp.eye(d), (*shape, d, d)), jnp.asarray(random_spd(rng, shape))):
+        direction = rng.standard_normal(tensors.shape)
+        direction = jnp.asarray(0.1 * (direction + np.swapaxes(direction, -1, -2)))
+        expected = float(directional(value, tensors, direction))
+        assert jnp.vdot(gradient(tensors), direction) == pytest.approx(expected, rel=1e-8)
+        assert forward(tensors, direction) == pytest.approx(expected, rel=1e-8)
 
 
 def test_batches_agree_with_a_loop(rng):
