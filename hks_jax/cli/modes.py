@@ -23,6 +23,7 @@ examples:
 """
 
 import argparse
+import math
 from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
@@ -104,8 +105,11 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
             projected = np.asarray(reconstruct(pairs, coefficients))
             counts = sorted({max(1, round(pairs.k**power)) for power in (1 / 3, 2 / 3, 1)})
             for n in counts:
-                title = f"{n} modes: {float(found.explained[0, n - 1]):.0%}"
-                shown[title] = np.asarray(reconstruct(pairs, coefficients[0, :n]))
+                share = float(found.explained[0, n - 1])
+                of_one = f"{'map 1, ' * (len(maps) > 1)}{n} modes"
+                shown[of_one + f": {share:.0%}" * math.isfinite(share)] = np.asarray(
+                    reconstruct(pairs, coefficients[0, :n])
+                )
             shown[args.map.name] = np.where(np.isfinite(functions[0]), maps[0], np.nan)
     report = {
         "input": domain.about,

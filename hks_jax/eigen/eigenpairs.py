@@ -240,7 +240,7 @@ class Eigenpairs(ABC):
 
     def messages(self) -> list[str]:
         """Return sentences that describe defects of these pairs. Values must be concrete."""
-        other = "a larger basis" if "shift-invert" in self.solver_name else "another solver"
+        other = "a larger basis or another solver" if "shift-invert" in self.solver_name else "another solver"
         values, bad = np.asarray(self.eigenvalues), ~np.asarray(self.converged)
         kept, (_, cut_multiplet, unconfirmed) = int(np.asarray(self.kept).sum()), self._cut
         cut = int(cut_multiplet)

@@ -33,6 +33,8 @@ def _relative(predicted: Array, target: Array) -> Array:
     return predicted / target - 1
 
 
+_ZERO = 1e-6
+"""The largest eigenvalue of constants in a target, relative to the last eigenvalue."""
 LOSSES: dict[str, Loss] = {"log": _log_ratio, "relative": _relative, "absolute": operator.sub}
 
 
@@ -109,7 +111,13 @@ class Observation(eqx.Module):
         return self.compare(self.predict(pairs))
 
     def compare(self, predicted: Array) -> Float[Array, " m"]:
-        """Return the residuals of a predicted signature that has the target's shape."""
+        """Return the residuals of a predicted signature; raise ValueError if it has another shape than the target."""
+        if predicted.shape != self.shape:
+            raise ValueError(
+                f"target: got shape {self.shape}, but the signature of the fitted metric has the shape "
+                f"{predicted.shape}; expected equal shapes. Check the function that computes the signature, and the "
+                "grid of `Free` unknowns"
+            )
         return self.root_weights * self.loss(predicted.reshape(-1)[self.entries.value], self.target)
 
     def truncation_misfit(self, pairs: Eigenpairs) -> Float[Array, ""]:
@@ -170,7 +178,13 @@ def observe(target: Any, times: Any, data: Data, space: FunctionSpace, dtype: An
         raise ValueError("weights: got negative, infinite or NaN weights; expected numbers ≥ 0 (0: not observed)")
     used = (given > 0) & (space.free if signature.at_nodes else True)
     if signature.lowest:
-        used &= np.arange(values.size) >= space.n_null  # constants have the eigenvalue 0 for every metric
+        constants = np.arange(values.size) < space.n_null  # which have the eigenvalue 0 for every metric
+        wrong = used & constants & (np.abs(values) > _ZERO * np.nanmax(np.abs(values)))
+        remedy = f"The target begins with {space.n_null} zeros, one for the constants of each component"
+        _refuse("target", values, wrong, used, "not zero, although they are eigenvalues of constants", remedy)
+        descending = used & (np.diff(values, prepend=-np.inf) < 0)
+        _refuse("target", values, descending, used, "less than the value before", "Sort the eigenvalues")
+        used &= ~constants
     if not used.any():
         raise ValueError("weights: got only zeros inside the domain; expected a positive weight at some entry")
     remedy = "Correct the invalid values, give them the weight 0, or remove their nodes from the mask"

@@ -25,6 +25,8 @@ from hks_jax.storage import load_npz
 NAMES = ("hks", "curvature")
 KEPT = ("deviation", "bias", "z", "noise_maps", "scaled_times", "density", "input_tensors", "influence")
 """The arrays of a file that a result keeps, beside its values, times and eigenvalues."""
+_ROUNDED = 1e-9
+"""The share by which a time may be below the smallest resolved one, at which automatic times begin."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,7 +231,7 @@ class Result:
         if not self.eigenvalues.size or self.settings.get("method", "spectral") != "spectral":
             return 0.0
         last = float(self.eigenvalues[-1])
-        return RESOLVED[self.dimension] / last if last > 0 else math.inf
+        return RESOLVED[self.dimension] / last * (1 - _ROUNDED) if last > 0 else math.inf
 
     @property
     def flat_scale(self) -> Float[np.ndarray, "n_times ..."]:

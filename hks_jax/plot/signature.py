@@ -116,14 +116,22 @@ def _on_mesh(
 
 
 def anatomy(result: Result) -> dict[str, Real[np.ndarray, "*shape"]]:
-    """Return the mean diffusivity (*shape,), NaN outside the domain, by its title; nothing if no diffusion is known."""
+    """Return the mean diffusivity (*shape,), NaN outside the domain, by its title; nothing if no diffusion is known.
+
+    In a slice, it is the mean of the in-plane block of each tensor.
+    """
     if result.diffusivity is None or result.tensors is None:
         return {}
     values = np.trace(result.tensors, axis1=-2, axis2=-1) / result.dimension
     values = np.where(np.isfinite(result.values[0]), values, np.nan)
+    name = _in_plane(result) + "mean diffusivity"
     if result.unit != "s":
-        return {"mean diffusivity": values}
-    return {f"mean diffusivity\nin $10^{{-3}}$ {MM2_PER_S}": 1e3 * values}
+        return {name: values}
+    return {f"{name}\nin $10^{{-3}}$ {MM2_PER_S}": 1e3 * values}
+
+
+def _in_plane(result: Result) -> str:
+    return "in-plane " * (result.dimension == 2)
 
 
 def quantity(result: Result) -> str:
@@ -171,7 +179,7 @@ def legend(result: Result, near: Bool[np.ndarray, "n_times *shape"] | None) -> l
     words = []
     if result.diffusivity is not None:
         unit = f" {MM2_PER_S}" * (result.unit == "s")
-        words.append(f"D = {number_text(result.diffusivity)}{unit}, the median mean diffusivity")
+        words.append(f"D = {number_text(result.diffusivity)}{unit}, the median {_in_plane(result)}mean diffusivity")
     if near is not None and near.any():
         words.append(f"hatched: {RIM_NOTE}")
     return words if result.z is None else [*words, FADED_NOTE]

@@ -140,28 +140,34 @@ def is_known(pairs: Eigenpairs) -> bool:
 # From the distance d to a straight side, the first passage time τ has E exp(−4τ/t) = exp(−2d/√t), and the function
 # u = E exp(−4τ/t) is 1 on the boundary and solves u = (t/4) Δu inside. The share exp(−d²/t) equals exp(−log²(u)/4).
 # Between two sides, u is nearly the sum of the functions of both sides, as is the share. The function w = 1 − u
-# vanishes on the boundary, so that one equation, (M + (t/4) K) w = M 1, serves for all boundary conditions.
+# vanishes on the boundary, so that one equation, (M + (t/4) K) w = M 1, serves for all boundary conditions. For linear
+# elements, M is the mean of the consistent and a lumped mass, whose errors of second order cancel. With the consistent
+# mass, u would fall too fast from the boundary where t is as small as the squared node distance.
 def _estimate(pencil: Pencil, rim: Bool[np.ndarray, "*shape"], times: Float[Array, " m"]) -> Float[Array, "m *shape"]:
     space = pencil.space
     inner = (space.free & ~rim).ravel()[np.flatnonzero(space.free.ravel())]
     if not rim.any() or not inner.any():
         found = jnp.full((times.size, space.n_dof), float(rim.any()), times.dtype)
     else:
-        found = _hitting(*jax.lax.stop_gradient((pencil.stiffness, pencil.mass)), inner, times)
+        linear = space.degree == 1 and pencil.row_sums is None
+        found = _hitting(*jax.lax.stop_gradient((pencil.stiffness, pencil.mass)), inner, times, linear)
     values = jnp.where(rim, 1.0, space.extend(found, outside=0.0))
     return nan_outside(values.astype(times.dtype), space.domain)
 
 
-@numpy_where_known(most=_ON_HOST)
-def _hitting(stiffness: Any, mass: Any, inner: Any, times: Any) -> Any:
+@numpy_where_known(most=_ON_HOST, static_argnums=4)
+def _hitting(stiffness: Any, mass: Any, inner: Any, times: Any, linear: bool) -> Any:
     """Return exp(−log²(u)/4) at the unknowns, for the solution u at each time."""
     xp = library_of(times)
-    scale, inside = times / 4, inner[:, None]
-    one = xp.where(inside, (mass @ xp.ones(inner.size, times.dtype))[:, None], 0) * xp.ones_like(times)
-    diagonal = xp.where(inside, mass.diagonal()[:, None] + scale * stiffness.diagonal()[:, None], 1)
+    scale, inside, share = times / 4, inner[:, None], 0.5 if linear else 0.0
+    measure, of_mass = (mass @ xp.ones(inner.size, times.dtype))[:, None], mass.diagonal()[:, None]
+    lumped = share * of_mass * (xp.sum(measure) / xp.sum(of_mass))
+    one = xp.where(inside, (1 - share) * measure + lumped, 0) * xp.ones_like(times)
+    diagonal = xp.where(inside, (1 - share) * of_mass + lumped + scale * stiffness.diagonal()[:, None], 1)
 
     def product(x: Any) -> tuple[Any, Any]:
-        return xp.where(inside, mass @ x + stiffness @ (scale * x), x), xp.zeros_like(times)
+        image = lumped * x + mass @ ((1 - share) * x) + stiffness @ (scale * x)
+        return xp.where(inside, image, x), xp.zeros_like(times)
 
     wanted = xp.full_like(times, _TOLERANCE)
     w = conjugate_gradients(product, lambda r: r / diagonal, one, wanted, most=_STEPS).x

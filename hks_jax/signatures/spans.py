@@ -46,7 +46,7 @@ def resolved_span(pairs: Eigenpairs, n: int) -> Float[Array, " n"]:
     """Return n log-spaced times as `default_times`, from the first time that the eigenpairs resolve.
 
     At the first time, at most 1 % of the signature is truncated. At the last time, √t is at most a third of the length
-    of an interval with the same first positive eigenvalue.
+    of an interval with the same first positive eigenvalue, but t is at least twice the first time.
     """
     last = positive_range(pairs)[1]
     first = RESOLVED[dimension_of(pairs, "default times")] / last

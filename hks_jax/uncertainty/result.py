@@ -202,11 +202,14 @@ class Uncertainty(eqx.Module):
         """Return `signal_to_noise` over the given nodes, for example nodes with little influence of the boundary.
 
         Args:
-            nodes: bool array that broadcasts to the shape of the value; if it is False everywhere, the ratio is NaN.
+            nodes: bool array that broadcasts to the shape of the value; if it is False everywhere, or if the value is a
+                number or one number for each t, the ratio is NaN.
         """
 
         def of(value: Array, null: Array, width: Array) -> Array:
             axes = tuple(range(1, value.ndim))
+            if not axes:  # numbers, which have no variance over nodes
+                return jnp.full(value.shape, jnp.nan, value.dtype)
             signal, width = (jnp.where(nodes, each, jnp.nan) for each in (value - null, width))
             noise = jnp.nanmean(width**2, axis=axes)
             return jnp.sqrt(jnp.maximum(jnp.nanvar(signal, axis=axes) - noise, 0) / noise)

@@ -198,6 +198,18 @@ def test_all_copies_of_a_highly_multiple_eigenvalue_are_found():
     np.testing.assert_allclose(hj.hks(sparse, [4.0]), hj.hks(dense, [4.0]), rtol=1e-9)
 
 
+def test_a_barrier_of_slow_diffusion_takes_no_digits():
+    """Its metric D⁻¹ has nearly all of the volume, by which the solver once chose its shift."""
+    diffusivity = np.tile(np.eye(2), (41, 41, 1, 1))
+    diffusivity[19:21] *= 1e-11
+    field = hj.TensorField.from_diffusion(hj.Grid.from_bounds(0, 1, (41, 41)), diffusivity, operator="fick")
+    pairs = hj.eigenpairs(field, 12, solver="shift-invert")
+    assert pairs.converged.all()
+    pencil = hj.assemble(field)
+    exact = scipy.linalg.eigh(pencil.stiffness.to_dense(), pencil.mass.to_dense(), eigvals_only=True)[:12]
+    np.testing.assert_allclose(pairs.eigenvalues, exact, atol=1e-9)
+
+
 def test_unconverged_pairs_are_reported_not_hidden(rng):
     field = hj.TensorField(hj.Grid((20, 20)), random_spd(rng, (20, 20), 3.0))
     with pytest.warns(hj.AccuracyWarning, match="of 30 eigenpairs did not converge .*or a larger basis"):

@@ -380,6 +380,15 @@ SIMPLE_SPECTRA = {
 }
 
 
+@pytest.mark.filterwarnings("ignore:k = 25 cuts a multiple eigenvalue")
+@pytest.mark.parametrize("lowest", [-1e4, -1e8])
+def test_an_eigenvalue_far_below_hides_no_others(lowest):
+    """Twenty copies of zero, and simple eigenvalues: the search near zero finds few copies at first."""
+    exact = np.concatenate([[lowest], np.zeros(20), 1e-3 * np.arange(1, 1980)])
+    pairs = hj.eigsh(sp.diags(exact).tocsr(), None, 25)
+    np.testing.assert_allclose(pairs.eigenvalues, exact[:25], atol=1e-15 * abs(lowest) + 1e-10)
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:k = 6 cuts a multiple eigenvalue")
 @pytest.mark.parametrize(

@@ -180,6 +180,21 @@ def test_converged_means_the_unknowns():
     assert deviation < 3e-3
 
 
+def test_targets_of_another_shape_or_without_their_zeros_are_refused():
+    free, target = Free(lambda s: s * CONFORMAL.tensors, jnp.array(1.1)), signature(CONFORMAL)
+    given = Data(signature=lambda pairs: hj.hks(pairs, TIMES))
+    for other in (np.moveaxis(target, 0, -1), np.concatenate([target, target])):
+        with pytest.raises(
+            ValueError, match=r"target: got shape .* the signature of the fitted metric has the shape \(4, "
+        ):
+            hj.fit_metric(CONFORMAL, other, None, free, k=K, data=given)
+    values = np.asarray(hj.eigenpairs(CONFORMAL, 8, multiplet="complete").eigenvalues)
+    with pytest.raises(ValueError, match=r"1 of 7 observed values that are not zero, .* begins with 1 zeros"):
+        hj.fit_metric(CONFORMAL, values[1:8], None, "conformal", data=Data("eigenvalues"))
+    with pytest.raises(ValueError, match=r"less than the value before .* Sort the eigenvalues"):
+        hj.fit_metric(CONFORMAL, values[[0, 2, 1, 3]], None, "conformal", data=Data("eigenvalues"))
+
+
 def test_a_fit_that_starts_at_the_solution_has_converged():
     fit = hj.fit_metric(CONFORMAL, signature(CONFORMAL), TIMES, "conformal", k=K)
     assert fit.result == "converged"

@@ -218,7 +218,8 @@ def test_figure_6_draws_the_brain_beside_its_anatomy(tmp_path, drawn, monkeypatc
         image = ax.images[0].get_array()
         assert 0.3 < image.count() / image.size < 0.95  # nothing outside the mask
         assert {text.get_text() for text in ax.texts} == set("LRAP")
-    assert [ax.get_title().split("\n")[0] for ax in panels[0]] == ["mean diffusivity", "5 mm", "7 mm", "10 mm", "14 mm"]
+    titles = [ax.get_title().split("\n")[0] for ax in panels[0]]
+    assert titles == ["in-plane mean diffusivity", "5 mm", "7 mm", "10 mm", "14 mm"]
     assert [ax.get_ylabel() for ax in panels[:, 0]] == [ax.get_xlabel() for ax in panels[1, :2]] == ["mm", "mm"]
     for ax in panels[:, 1:].flat:
         assert "HKS" in ax.child_axes[0].get_ylabel()

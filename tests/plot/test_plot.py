@@ -519,9 +519,9 @@ def test_pictures_of_a_signature_name_it_and_the_distance_of_diffusion(normalisa
     report = {"settings": {"metric": "inverse", "normalisation": normalisation}}
     values = np.stack([np.linspace(0.9, 1.1, 30).reshape(6, 5)] * 2)
     figure = signature_panels(Result(place, values, np.array([2.0, 8.0]), report=report))
-    assert figure.get_suptitle().startswith(f"{title}, metric D⁻¹\nD = 2 mm²/s, the median mean diffusivity")
+    assert figure.get_suptitle().startswith(f"{title}, metric D⁻¹\nD = 2 mm²/s, the median in-plane mean diffusivity")
     titles = [ax.get_title() for ax in figure.axes]
-    known = "mean diffusivity\nin $10^{-3}$ mm²/s"
+    known = "in-plane mean diffusivity\nin $10^{-3}$ mm²/s"
     assert titles == ["$t$ = 2 s\n$\\sqrt{Dt}$ = 2 mm", "$t$ = 8 s\n$\\sqrt{Dt}$ = 4 mm", known]
     # The anatomy is grey and has the mean eigenvalues; axes have their unit, colour bars their quantity.
     anatomy = figure.axes[2].images[0]

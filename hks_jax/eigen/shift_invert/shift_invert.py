@@ -31,6 +31,8 @@ _BLOCK, _MANY = 4, 200
 """The number of vectors per block for few pairs, and the number of pairs from which on blocks are twice as wide."""
 _BESIDE = 1e-6
 """The distance of a count of eigenvalues below the last computed one, relative to the range of the computed ones."""
+_LEAST_SHIFT = 1e-6
+"""The least distance of a shift below the spectrum, relative to the median of K's diagonal divided by that of M."""
 _TOLD = 25
 """The least number of solves between two reports."""
 _FEW = 12
@@ -160,9 +162,9 @@ class ShiftInvert(Eigensolver[Pencil]):
             # Lanczos can miss copies of a multiple eigenvalue. By Sylvester's law of inertia, the negative pivots of
             # K − σM count the eigenvalues below σ. If pairs are missing, search orthogonally to known pairs.
             # The count is just below the last value, beyond its rounding errors; if the factorisation is too inaccurate
-            # there, further below.
-            margin = max(_BESIDE * (values[-1] - values[0]), 4 * rounding)
-            for distance in (margin, max(30 * margin, _BESIDE * max(values[-1], scales.below))):
+            # there, further below. A few eigenvalues far below the others do not enlarge the first distance.
+            spread, margin = (max(_BESIDE * (values[-1] - low), 4 * rounding) for low in (np.median(values), values[0]))
+            for distance in (spread, margin, max(30 * margin, _BESIDE * max(values[-1], scales.below))):
                 below = values[-1] - distance
                 if below <= 0:  # only null vectors
                     return _ordered(values, vectors, 0.0)
@@ -186,11 +188,13 @@ class _Scales(NamedTuple):
 
 
 def _scales(K: csc_matrix, M: csc_matrix, k: int, dimension: int | None, volume: float) -> _Scales:
-    if dimension is not None and np.isfinite(volume):
-        return _Scales(0.1 * (2 * np.pi) ** 2 / volume ** (2 / dimension), weyl(k, volume, dimension) / 2, dimension)
-    # On a uniform grid in 2D, the k-th of n eigenvalues is about 2k/n times the median.
     quotients = np.abs(K.diagonal() / M.diagonal())
     median = float(np.median(quotients[quotients > 0])) if (quotients > 0).any() else 1.0
+    if dimension is not None and np.isfinite(volume):
+        # Beside a smaller shift, rounding would matter: nodes where diffusion is slow make nearly all of the volume.
+        below = max(0.1 * (2 * np.pi) ** 2 / volume ** (2 / dimension), _LEAST_SHIFT * median)
+        return _Scales(below, weyl(k, volume, dimension) / 2, dimension)
+    # On a uniform grid in 2D, the k-th of n eigenvalues is about 2k/n times the median.
     return _Scales(1e-3 * median, median * k / K.shape[0], 2)
 
 

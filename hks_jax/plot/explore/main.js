@@ -114,7 +114,9 @@ function sliceText(plane) {
 
 function layerText(layer, node) {
   if (layer.kind !== "direction") return number(layer.values[node]);
-  return [0, 1, 2].slice(0, dimension).map((a) => layer.values[3 * node + a].toFixed(2)).join(", ").replaceAll("-", "−");
+  const vector = [0, 1, 2].slice(0, dimension).map((a) => layer.values[3 * node + a]);
+  const length = Math.hypot(...vector); // the anisotropy, for colours
+  return length ? vector.map((x) => (x / length).toFixed(2)).join(", ").replaceAll("-", "−") : "—";
 }
 
 function showHover(place) {

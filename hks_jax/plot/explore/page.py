@@ -251,7 +251,7 @@ def _tensor_layers(tensors: Real[ArrayLike, "*shape d d"], inside: Bool[np.ndarr
     direction = np.zeros((len(array), 3))
     direction[:, :d] = anisotropy[:, None] * np.take_along_axis(vectors, largest[:, None, None], axis=2)[..., 0]
     return {
-        "Mean eigenvalue (diffusivity)": mean,
+        "Mean eigenvalue": mean,
         "Anisotropy (λ₁ − λ₂)/(λ₁ + λ₂)" if d == 2 else "Fractional anisotropy": anisotropy,
         "Principal direction": direction,
     }
