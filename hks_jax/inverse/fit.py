@@ -112,6 +112,9 @@ def fit_metric(
                 "jax.value_and_grad with respect to the mesh's vertices or metric, or sample the domain on a grid"
             )
         raise TypeError(f"init: got {type(init).__name__}; expected hks_jax.Grid or hks_jax.TensorField{remedy}")
+    if isinstance(regularisers, Regulariser):
+        name = type(regularisers).__name__
+        raise TypeError(f"regularisers: got one {name}; expected a list of penalties, such as [{name}(…)]")
     pencil = assemble(init, boundary)
     space = pencil.space
     assert isinstance(space, GridSpace)

@@ -903,6 +903,13 @@ def test_fit_errors_are_one_line_and_leave_nothing(conformal, tmp_path, capsys, 
     assert sorted(tmp_path.iterdir()) == before
 
 
+@pytest.mark.slow
+def test_a_reader_that_has_enough_ends_the_output_silently(npz):
+    command = f"{sys.executable} -m hks_jax info --json {npz} | head -c 1; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "{", "")
+
+
 def test_a_second_scan_beside_images_is_a_file_of_tensors():
     words = ["hks", "dwi.nii.gz", "--bval", "a.bval", "--bvec", "a.bvec", "--b-max", "1200"]
     words += ["--noise", "second.nii.gz", "-o", "out"]

@@ -615,6 +615,11 @@ def test_bad_arguments_are_named(changes, message):
 def test_an_array_is_no_place_to_start():
     with unchecked(), pytest.raises(TypeError, match=r"init: got ndarray; expected hks_jax\.Grid or hks_jax\.Tensor"):
         hj.fit_metric(np.ones((4, N, N)), TIMES, FLAT)
+    with (
+        unchecked(),
+        pytest.raises(TypeError, match=r"regularisers: got one H1; expected a list of penalties, such as"),
+    ):
+        hj.fit_metric(FLAT, np.ones((4, N, N)), TIMES, regularisers=H1(1e-3))
 
 
 def test_solvers_of_optimistix_are_taken_as_they_are():
