@@ -106,10 +106,8 @@ def run(args: argparse.Namespace, progress: Progress) -> Done:
             counts = sorted({max(1, round(pairs.k**power)) for power in (1 / 3, 2 / 3, 1)})
             for n in counts:
                 share = float(found.explained[0, n - 1])
-                of_one = f"{'map 1, ' * (len(maps) > 1)}{n} modes"
-                shown[of_one + f": {share:.0%}" * math.isfinite(share)] = np.asarray(
-                    reconstruct(pairs, coefficients[0, :n])
-                )
+                title = f"{'map 1, ' * (len(maps) > 1)}{n} modes" + f": {share:.0%}" * math.isfinite(share)
+                shown[title] = np.asarray(reconstruct(pairs, coefficients[0, :n]))
             shown[args.map.name] = np.where(np.isfinite(functions[0]), maps[0], np.nan)
     report = {
         "input": domain.about,

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import require_static
+from hks_jax.domain import spd
 from hks_jax.domain.components import as_mask
 from hks_jax.domain.tensor_checks import lost_determinants
 from hks_jax.domain.triangulation import Triangulation
@@ -184,7 +185,7 @@ def check_metric(
     edges = positions[cells[:, 1:]] - positions[cells[:, :1]]
     longest = np.abs(edges).max(axis=(1, 2), keepdims=True)
     shape = edges / longest
-    thin = np.linalg.det(shape @ np.swapaxes(shape, 1, 2)) < _THIN * np.finfo(dtype).eps
+    thin = spd.determinant(shape @ np.swapaxes(shape, 1, 2)) < _THIN * np.finfo(dtype).eps
     with np.errstate(over="ignore"):
         lost, digits = lost_determinants(edges @ np.swapaxes(edges, 1, 2), dtype)
     of_unit, wrong = lost & ~thin, np.isnan(metric).any(axis=(1, 2))
