@@ -35,6 +35,8 @@ def _relative(predicted: Array, target: Array) -> Array:
 
 _ZERO = 1e-6
 """The largest eigenvalue of constants in a target, relative to the last eigenvalue."""
+_ROUNDING = 100
+"""The relative rounding error of a signature in units of ε; no step of a fit can reduce such errors reliably."""
 LOSSES: dict[str, Loss] = {"log": _log_ratio, "relative": _relative, "absolute": operator.sub}
 
 
@@ -120,6 +122,12 @@ class Observation(eqx.Module):
             )
         return self.root_weights * self.loss(predicted.reshape(-1)[self.entries.value], self.target)
 
+    @property
+    def rounding_misfit(self) -> Float[Array, ""]:
+        """The misfit of a signature with rounding errors only, in the units of the loss."""
+        rounded = self.target * (1 + _ROUNDING * jnp.finfo(self.target.dtype).eps)
+        return jnp.sum((self.root_weights * self.loss(rounded, self.target)) ** 2) / 2
+
     def truncation_misfit(self, pairs: Eigenpairs) -> Float[Array, ""]:
         """Estimate the misfit between the metric's signatures from k and from all eigenpairs.
 
@@ -179,10 +187,12 @@ def observe(target: Any, times: Any, data: Data, space: FunctionSpace, dtype: An
     used = (given > 0) & (space.free if signature.at_nodes else True)
     if signature.lowest:
         constants = np.arange(values.size) < space.n_null  # which have the eigenvalue 0 for every metric
-        wrong = used & constants & (np.abs(values) > _ZERO * np.nanmax(np.abs(values)))
+        largest = np.max(np.abs(values), initial=0, where=used & np.isfinite(values))
+        wrong = used & constants & (np.abs(values) > _ZERO * largest)
         remedy = f"The target begins with {space.n_null} zeros, one for the constants of each component"
         _refuse("target", values, wrong, used, "not zero, although they are eigenvalues of constants", remedy)
-        descending = used & (np.diff(values, prepend=-np.inf) < 0)
+        descending = np.zeros(values.shape, bool)
+        descending[used] = np.diff(values[used], prepend=-np.inf) < 0
         _refuse("target", values, descending, used, "less than the value before", "Sort the eigenvalues")
         used &= ~constants
     if not used.any():

@@ -18,8 +18,6 @@ from hks_jax.inverse.unknowns import Values
 Optimiser = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
 _REJECTIONS = 12
 """The number of consecutive rejected steps after which a fit counts as stalled."""
-_ROUNDED = 100
-"""The root mean square of all residuals that is due to rounding, in units of ε; no step can reduce it reliably."""
 
 
 def _residuals(values: Values, problem: Problem) -> tuple[Array, Outcome]:
@@ -99,7 +97,7 @@ def optimise(
     best, least, seen = Reached(values, None, ""), np.inf, None
     rejected, number, end = 0, 0, ""
     explained = float(values.dtype.type(-1.0 if noise is None else noise**2 / 2))  # rounded as in `_advance`
-    rounding = (_ROUNDED * float(jnp.finfo(values.dtype).eps)) ** 2 / 2
+    rounding = float(problem.observation.rounding_misfit)
     try:
         state = _begin(optimiser, fn, values, problem)
         # Take one step more than `max_steps`, because many solvers return the result of a step only in the next step.

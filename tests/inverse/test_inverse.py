@@ -191,6 +191,10 @@ def test_targets_of_another_shape_or_without_their_zeros_are_refused():
     values = np.asarray(hj.eigenpairs(CONFORMAL, 8, multiplet="complete").eigenvalues)
     with pytest.raises(ValueError, match=r"1 of 7 observed values that are not zero, .* begins with 1 zeros"):
         hj.fit_metric(CONFORMAL, values[1:8], None, "conformal", data=Data("eigenvalues"))
+    unobserved = np.append(values[:3], [np.nan, 1e9, *values[5:]])
+    space = hj.assemble(CONFORMAL).space
+    observed, _ = observe(unobserved, None, Data("eigenvalues", weights=unobserved < 1e8), space, np.float64)
+    np.testing.assert_array_equal(observed.entries.value, np.delete(np.arange(values.size), [0, 3, 4]))
     with pytest.raises(ValueError, match=r"less than the value before .* Sort the eigenvalues"):
         hj.fit_metric(CONFORMAL, values[[0, 2, 1, 3]], None, "conformal", data=Data("eigenvalues"))
 
@@ -199,6 +203,12 @@ def test_a_fit_that_starts_at_the_solution_has_converged():
     fit = hj.fit_metric(CONFORMAL, signature(CONFORMAL), TIMES, "conformal", k=K)
     assert fit.result == "converged"
     assert len(fit.history) == 1
+    # Residuals are not rounding errors because the unit of length makes them small.
+    scale, search = 1e16, Search(max_steps=1)
+    start, truth = (hj.TensorField(GRID, scale * np.asarray(field.tensors)) for field in (FLAT, CONFORMAL))
+    target = signature(truth, times=scale * TIMES)
+    fit = hj.fit_metric(start, target, scale * TIMES, "conformal", k=K, data=Data(loss="absolute"), search=search)
+    assert fit.result == "steps exhausted"
 
 
 @pytest.mark.slow
