@@ -124,9 +124,6 @@ def _run(args: argparse.Namespace) -> int:
             done = args.run(args, progress)
         if done is not None:
             show(args, done)
-            sys.stdout.flush()
-    except BrokenPipeError:  # a program such as head has read enough of the output; all results are written
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except KeyboardInterrupt:
         return _fail(args, "interrupted", INTERRUPTED)
     except np.linalg.LinAlgError as error:

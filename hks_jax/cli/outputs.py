@@ -3,6 +3,7 @@
 import argparse
 import importlib.metadata
 import json
+import os
 import platform
 import sys
 import zipfile
@@ -42,10 +43,14 @@ class Done(NamedTuple):
 def show(args: argparse.Namespace, done: Done) -> None:
     """Print the output of a command in the form that the arguments choose."""
     names = list(map(str, done.files))
-    if args.json:
-        print(json.dumps(plain({**done.summary, "files": names}), ensure_ascii=False))
-    elif not args.quiet:
-        print("\n".join(names) if done.text is None else done.text)
+    try:
+        if args.json:
+            print(json.dumps(plain({**done.summary, "files": names}), ensure_ascii=False))
+        elif not args.quiet:
+            print("\n".join(names) if done.text is None else done.text)
+        sys.stdout.flush()
+    except BrokenPipeError:  # a program such as head has read enough; all results are written
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @contextmanager
