@@ -11,7 +11,7 @@ from hks_jax.accuracy import warn_of_accuracy
 from hks_jax.checks import require_static
 from hks_jax.domain import spd
 from hks_jax.domain.components import as_mask
-from hks_jax.domain.tensor_checks import lost_determinants
+from hks_jax.domain.tensor_checks import lost_determinants, scaled_to_one
 from hks_jax.domain.triangulation import Triangulation
 
 _FLAT = 1e-10
@@ -186,8 +186,8 @@ def check_metric(
     longest = np.abs(edges).max(axis=(1, 2), keepdims=True)
     shape = edges / longest
     thin = spd.determinant(shape @ np.swapaxes(shape, 1, 2)) < _THIN * np.finfo(dtype).eps
-    with np.errstate(over="ignore"):
-        lost, digits = lost_determinants(edges @ np.swapaxes(edges, 1, 2), dtype)
+    with np.errstate(over="ignore", invalid="ignore"):
+        lost, digits = lost_determinants(*scaled_to_one(edges @ np.swapaxes(edges, 1, 2)), dtype)
     of_unit, wrong = lost & ~thin, np.isnan(metric).any(axis=(1, 2))
     remedy = ", or use float64" * (dtype != np.float64)
     if of_unit.any():

@@ -91,8 +91,7 @@ def require_spd(
                 require_spd(name, tensors[part], inside[part], place)
             return
     require_finite_symmetric(name, tensors, inside, place)
-    size = np.abs(tensors).max(axis=(-2, -1))
-    scaled = tensors / np.where(size > 0, size, 1)[..., None, None]
+    scaled, size = scaled_to_one(tensors)
     bad = inside & ~spd.is_spd(scaled)
     if bad.any():
         what = f"not positive definite, worst eigenvalue {least_eigenvalue(tensors[bad]):.3g}"
@@ -103,7 +102,7 @@ def require_spd(
                 f"metric by hks_jax.TensorField.from_indefinite. {_MASK}, if they are outside the domain"
             )
         refuse_tensors(name, bad, inside, place, what, of_grids if place == "node" else "Raise their eigenvalues")
-    bad, digits = lost_determinants(tensors, tensors.dtype if tensors.dtype.kind == "f" else np.dtype(np.float64))
+    bad, digits = lost_determinants(scaled, size, tensors.dtype if tensors.dtype.kind == "f" else np.dtype(np.float64))
     bad &= inside
     if bad.any():
         about = f"about 1e{digits[bad][0]:.0f}, is beyond the accurate range of {tensors.dtype}"
@@ -111,19 +110,28 @@ def require_spd(
         refuse_tensors(name, bad, inside, place, what, "Use another unit, in which the eigenvalues are near 1")
 
 
+def scaled_to_one(
+    tensors: Float[np.ndarray, "*shape d d"],
+) -> tuple[Float[np.ndarray, "*shape d d"], Float[np.ndarray, "*shape"]]:
+    """Return tensors divided by their largest absolute entries, and these entries; zero tensors are not divided."""
+    size = np.abs(tensors).max(axis=(-2, -1))
+    return tensors / np.where(size > 0, size, 1)[..., None, None], size
+
+
 # Determinants are computed in the dtype of the tensors. XLA rounds numbers below the least normal one to zero, so such
 # terms of a determinant are small enough only relative to a determinant that is larger by 1/ε. The terms have the order
 # of the product of the largest entries, also if the determinant is much smaller.
 def lost_determinants(
-    tensors: Float[np.ndarray, "*shape d d"], dtype: np.dtype
+    scaled: Float[np.ndarray, "*shape d d"], size: Float[np.ndarray, "*shape"], dtype: np.dtype
 ) -> tuple[Bool[np.ndarray, "*shape"], Float[np.ndarray, "*shape"]]:
-    """Mark positive definite tensors whose determinant underflows or overflows, and return its decimal logarithm."""
-    d, limits = tensors.shape[-1], np.finfo(dtype)
-    size = np.abs(tensors).max(axis=(-2, -1)).astype(np.float64)
-    scaled = tensors.astype(np.float64) / np.where(size > 0, size, 1)[..., None, None]
+    """Mark positive definite tensors whose determinant underflows or overflows, and return its decimal logarithm.
+
+    The tensors are given by the result of `scaled_to_one`.
+    """
+    d, limits = scaled.shape[-1], np.finfo(dtype)
     with np.errstate(divide="ignore", invalid="ignore"):  # outside the mask
-        terms = d * np.log10(size)
-        digits = np.log10(spd.determinant(scaled)) + terms
+        terms = d * np.log10(size.astype(np.float64))
+        digits = np.log10(spd.determinant(scaled.astype(np.float64))) + terms
         lowest, highest = np.log10(limits.tiny) - np.log10(limits.eps), np.log10(limits.max) - 1
         return ~((digits > lowest) & (terms < highest)), digits
 
