@@ -71,8 +71,8 @@ class Reading:
         """The second scan, if ``--noise`` names a file, or else None."""
         if self.noise is None or not is_file(self.noise):
             return None
-        tensors = replace(self, bval=None, bvec=None, bvec_frame=None, b_max=None)
-        return replace(tensors, file=Path(self.noise), others=(), noise=None)
+        of_images: Any = dict.fromkeys(("bval", "bvec", "bvec_frame", "b_max"))
+        return replace(self, file=Path(self.noise), others=(), noise=None, **of_images)
 
     @property
     def files(self) -> dict[str, list[str]]:

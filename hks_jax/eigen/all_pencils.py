@@ -59,7 +59,7 @@ def _of_several(
     problems = []
     for part, own, including, rows in zip(pencil.parts, solvers, pencil.including, starts, strict=True):
         limit = min(max(k // len(including), 1), part.size)
-        # Only the dense solver computes so many pairs of a small problem.
+        # If the solver cannot compute `limit` pairs of a small problem, the dense solver does.
         dense = limit >= own[0].max_pairs(part.size)
         problems.append(_Problem(part, (Dense(own[0].tolerance),) if dense else own, limit, rows))
     share = k if is_traced(jax.lax.stop_gradient(pencil)) else _share(pencil, k)

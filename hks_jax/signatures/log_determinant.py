@@ -162,8 +162,7 @@ def log_determinant(
     weights = np.linalg.solve(2.0 ** np.outer(np.append(0, powers), np.arange(count)), np.eye(count)[0])
     levels = [values[:, i : i + 2 * count : 2] @ jnp.asarray(weights, dtype) for i in range(3)]
     rest = jnp.maximum(jnp.abs(levels[0] - levels[1]), jnp.abs(levels[0] - levels[2]))
-    # Errors grow with T. A difference may be small by accident, where its sign changes; then that at the time before
-    # counts.
+    # Errors grow with T. A difference is small by accident where its sign changes, so the one before it counts too.
     rest = jnp.maximum(rest, jnp.pad(rest, (1, 0), mode="edge")[:-1])
     # With linear elements the trace has the relative error d h²/16t, three times the error of the signature at a node.
     bias = 3 * truncation(pairs, times).resolution_bias * jnp.abs(a[0]) * times ** (-d / 2) / (d / 2 + 1)

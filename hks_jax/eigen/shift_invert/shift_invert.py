@@ -164,7 +164,7 @@ class ShiftInvert(Eigensolver[Pencil]):
             # The count is just below the last value, beyond its rounding errors; if the factorisation is too inaccurate
             # there, further below. A few eigenvalues far below the others do not enlarge the first distance.
             spread, margin = (max(_BESIDE * (values[-1] - low), 4 * rounding) for low in (np.median(values), values[0]))
-            for distance in (spread, margin, max(30 * margin, _BESIDE * max(values[-1], scales.below))):
+            for distance in dict.fromkeys((spread, margin, max(30 * margin, _BESIDE * max(values[-1], scales.below)))):
                 below = values[-1] - distance
                 if below <= 0:  # only null vectors
                     return _ordered(values, vectors, 0.0)
