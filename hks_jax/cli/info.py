@@ -26,6 +26,7 @@ import numpy as np
 from hks_jax.cli import options
 from hks_jax.cli.computation import times_in_words
 from hks_jax.cli.meshes import describe_mesh
+from hks_jax.cli.outputs import print_output
 from hks_jax.cli.pairs import arrays_in, facts_of, is_saved_pairs
 from hks_jax.cli.progress import Progress
 from hks_jax.cli.reading import Reading, outside_note, read, without_element
@@ -69,7 +70,8 @@ def run(args: argparse.Namespace, progress: Progress) -> None:
             **describe(args.file, read(Reading.of(args), progress, questions.append)),
             "questions": questions,
         }
-    print(json.dumps(description, indent=2, ensure_ascii=False) if args.json else "\n".join(_lines(description)))
+    text = json.dumps(description, indent=2, ensure_ascii=False) if args.json else "\n".join(_lines(description))
+    print_output(text)
 
 
 def _result_of(path: Path) -> Result | None:

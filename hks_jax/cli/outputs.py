@@ -43,14 +43,18 @@ class Done(NamedTuple):
 def show(args: argparse.Namespace, done: Done) -> None:
     """Print the output of a command in the form that the arguments choose."""
     names = list(map(str, done.files))
+    if args.json:
+        print_output(json.dumps(plain({**done.summary, "files": names}), ensure_ascii=False))
+    elif not args.quiet:
+        print_output("\n".join(names) if done.text is None else done.text)
+
+
+def print_output(text: str) -> None:
+    """Print the output of a command, unless its reader, such as the program head, has ended."""
     try:
-        if args.json:
-            print(json.dumps(plain({**done.summary, "files": names}), ensure_ascii=False))
-        elif not args.quiet:
-            print("\n".join(names) if done.text is None else done.text)
-        sys.stdout.flush()
-    except BrokenPipeError:  # a program such as head has read enough; all results are written
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes the output again as it ends
 
 
 @contextmanager
